@@ -41,6 +41,7 @@ def true_drone() -> QuadrotorParams:
         linear_drag=[0.014, 0.014, 0.011],
         quadratic_drag=[0.0, 0.0, 0.0],
         drag_height=0.01,
+        max_thrust_to_weight=1.7,  # which its rotors reach
     )
     return dataclasses.replace(drone, motor_command=MotorCommand(700.0, 3.7, delay=0.012))
 
@@ -119,9 +120,10 @@ def _measured(table: np.ndarray, random: np.random.Generator, late: float, name:
 
 
 def start(seed: int, truth: QuadrotorParams) -> QuadrotorParams:
-    """A drone that is 30 % off, up or down, in everything that is fitted; the mass is right."""
+    """A drone that is 30 % off, up or down, in everything that is fitted; the mass is right, and a body can have it."""
     off = np.random.default_rng(1000 + seed).choice([0.7, 1.3], 7)
-    inertia = truth.inertia * torch.tensor([off[0], off[1], off[2]])
+    inertia = truth.inertia * torch.tensor(off[:3])
+    inertia[2] = inertia[2].minimum(inertia[:2].sum())
     motors = dataclasses.replace(truth.motor_command, delay=truth.motor_command.delay * off[3])
     return dataclasses.replace(
         truth.replace(

@@ -7,6 +7,7 @@ evaluations count. "Cold" is an empty compile cache. What is there already is le
 """
 
 import itertools
+import math
 import os
 import subprocess
 import sys
@@ -22,8 +23,8 @@ from torchrl_quad.files import read_rows
 RECIPES = Path(__file__).parents[1] / "recipes"
 
 
-def solve(algorithm: str, seed: int, overrides: list[str], cache: Path) -> float | None:
-    """Seconds to the first row of the metrics that has solved >= 0.99, or None."""
+def solve(algorithm: str, seed: int, overrides: list[str], cache: Path, limit: float = math.inf) -> float | None:
+    """Seconds to the first row of the metrics that has solved >= 0.99; None if it ends without, or after the limit."""
     with tempfile.TemporaryDirectory() as folder:
         metrics = Path(folder) / "run" / "metrics.csv"
         command = [sys.executable, str(RECIPES / f"{algorithm}.py"), f"seed={seed}", f"hydra.run.dir={metrics.parent}"]
@@ -40,7 +41,8 @@ def solve(algorithm: str, seed: int, overrides: list[str], cache: Path) -> float
                     seconds = time.perf_counter() - start
                     run.kill()
                     return seconds
-                if ended:
+                if ended or time.perf_counter() - start > limit:
+                    run.kill()
                     return None
                 time.sleep(0.05)
 

@@ -43,8 +43,7 @@ def main(cfg: DictConfig) -> None:
         update_normalizer(env, data)
         if cfg.normalize:  # observe again, with the new statistics
             run.carry = restart(env, run.carry, 0.0)
-        # Some are per step of the horizon where a policy has a memory.
-        run.record(**losses.exclude("loss_actor").apply(torch.mean))
+        run.record(**losses.exclude("loss_actor").apply(torch.mean))  # per step of the horizon with a memory
 
 
 if __name__ == "__main__":

@@ -3,6 +3,9 @@
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+# Drones of every kind of controller settings, for flights that would take too long with all that ship.
+FLOWN = ("crazyflie", "flightmare", "small_racer", "visfly")
+
 
 def fly(env, td, actions):
     """Step through a list of actions; returns the steps, stacked along time."""

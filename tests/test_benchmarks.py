@@ -6,6 +6,7 @@ import math
 import platform
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -46,7 +47,7 @@ def run(tmp_path, monkeypatch):
     ("profile_recipes", f"--algorithms bptt --iterations 2 --skip 1 --overrides {SMALL}", 1),
     pytest.param("identification", "--seeds 1 --seconds 10", 10, marks=pytest.mark.slow),  # it simulates a flight
     ("real_flights", "--flights flights --network-steps 2 --folder fits", 24),
-    ("identified_training", f"{ONE} --drones before=visfly --judge crazyflie --tasks hovering --no-compile", 2),
+    ("identified_training", f"{ONE} --drones before=cf2x --judge crazyflie --tasks hovering --no-compile", 2),
 )
 @pytest.mark.usefixtures("quick_fits")
 def test_a_benchmark_writes_a_table(name, arguments, rows, run, run_here, tmp_path, monkeypatch):
@@ -73,6 +74,30 @@ def test_the_benchmark_of_exported_policies_writes_a_table(run, monkeypatch):
     assert all(float(row[pair]) <= 1e-5 for row in rows for pair in ("torch - ONNX", "torch - C", "ONNX - C"))
 
 
+def test_the_benchmark_of_a_gpu_runs_on_the_cpu_writes_each_row_and_names_what_failed(run, monkeypatch):
+    commands, saved = [], []
+
+    def without_processes(module):
+        save, ended = module.save, SimpleNamespace(returncode=1, stderr="Error: it failed.")
+        monkeypatch.setattr(
+            module, "save", lambda path, rows, **about: [saved.append(len(rows)), save(path, rows, **about)]
+        )
+        monkeypatch.setattr(module, "in_own_process", lambda check: check())
+        monkeypatch.setattr(module, "solve", lambda *arguments: None)
+        monkeypatch.setattr(module.subprocess, "run", lambda command, **options: [commands.append(command), ended][1])
+
+    small = "--device cpu --num-envs 2 4 --modes eager --check-envs 2 --horizon 2 --seconds"
+    with pytest.raises(SystemExit, match=r"Not ok: checkpoint to CPU, hovering solved, racing solved\."):
+        run("gpu", f"{small} 480", without_processes)
+    rows = read_rows(Path("results.csv"))
+    assert [row["result"] for row in rows] == ["ok"] * 4 + ["Error: it failed.", "not solved", "not solved"] + [
+        "ok"
+    ] * 2
+    assert saved == list(range(1, 10)) and float(rows[0]["gradients"]) == 0 and "device=cpu" in commands[0]
+    assert all(0 < float(row["forward, of bound"]) < 1 for row in rows if row["check"].startswith("speed"))
+    assert {row["result"] for row in run("gpu", f"{small} 0", without_processes)} == {"no time left"}
+
+
 def test_the_benchmark_of_controllers_writes_a_table(run):
     rows = run("controllers", "--tasks hovering --starts 2 --mpc-starts 1 --steps 2 --calls 1")
     assert [row["policy"] for row in rows] == ["geometric", "mpc"]
@@ -93,11 +118,8 @@ def test_the_least_time_of_a_point_mass_is_the_one_worked_by_hand_and_below_ever
 
 def test_the_results_that_are_published_name_their_machine():
     published = list((BENCHMARKS / "results").glob("*.csv"))
-    programs = {path.stem.removesuffix("_recipes") for path in BENCHMARKS.glob("*.py")} - {
-        "laps",
-        "lap_bound",
-        "report",
-    }
+    programs = {path.stem.removesuffix("_recipes") for path in BENCHMARKS.glob("*.py")}
+    programs -= {"laps", "lap_bound", "report", "gpu"}
     assert {path.stem for path in published} == programs | {"transfer"}
     for path in published:
         assert all(row["machine"] for row in read_rows(path))

@@ -24,6 +24,7 @@ SMOKE = {  # the tests that run a program on a reduced budget
     **{f"recipes/{name}.py": "test_recipes" for name in (*RECIPES, "evaluate")},
     "recipes/export.py": "test_deploy_faults",
     "recipes/identify.py": "test_identification",
+    "recipes/import_drone.py": "test_drones",
     "recipes/transfer.py": "test_transfer",
     "benchmarks/paper/reproduce.py": "test_reproduce",
     "benchmarks/paper/results.py": "test_claims",
@@ -82,7 +83,7 @@ def understands(words, monkeypatch):
     script, *arguments = words
     is_run(script)
     arguments = [re.sub(r"\b(mypackage|shuttle)\.\w+", "own_task.CornerEnv", x) for x in arguments]
-    if script == "recipes/transfer.py":
+    if script in ("recipes/transfer.py", "recipes/import_drone.py"):
         runpy.run_path(str(ROOT / script))["settings"](arguments)
     elif Path(script).parent.name == "recipes":
         settings = [re.sub(r"^([\w.]+=[^,{\[]*),.*", r"\1", x) for x in arguments if not x.startswith(("--", "hydra"))]

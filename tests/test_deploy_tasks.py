@@ -231,8 +231,9 @@ CHANGES = [  # of a contract whose checksums fit
         "drone.rotor_positions and rotor_spin cannot control roll and pitch",
     ),
     ("plant", {"mass": 0}, "plant.mass: 0 is less than the minimum of 0.001"),
+    ("plant", {"inertia": [1e-3, 1e-3, 3e-3]}, "plant.inertia .* kg m2: in a body none of the three exceeds"),
     ("plant", {"wings": 2}, "plant: .*'wings' was unexpected"),
-    ("plant", {"rotor_speed_min": 9000}, "plant.rotor_speed_min is 9000, and must be below"),
+    ("plant", {"rotor_speed_min": 9000}, "plant.rotor_speed_min must be below rotor_speed_max"),
 ]
 
 

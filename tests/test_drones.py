@@ -4,6 +4,8 @@ import functools
 import itertools
 import json
 import re
+import runpy
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +14,8 @@ import torch
 import yaml
 from refusals import cases, refuses
 
-from torchrl_quad import HoveringEnv, QuadrotorParams, available_drones, load_drone, suggest_gains
-from torchrl_quad.dynamics import FlightController, presets
+from torchrl_quad import GeometricController, HoveringEnv, QuadrotorParams, available_drones, load_drone, suggest_gains
+from torchrl_quad.dynamics import FlightController, import_drone, presets
 from torchrl_quad.dynamics.gains import rate_loop
 from torchrl_quad.errors import DroneWarning, UserValueError, shown
 
@@ -21,10 +23,26 @@ VISFLY = {name: value.squeeze().tolist() for name, value in load_drone("visfly")
 
 
 @pytest.mark.parametrize("name", available_drones())
-def test_every_preset_can_hover_and_reach_its_commanded_thrust(name):
-    params = load_drone(name)
+def test_every_preset_can_hover_and_reach_its_commanded_thrust_with_a_rate_loop_as_damped_as_it_says(name):
+    params, text = load_drone(name), (Path(presets.__file__).parent / f"drones/{name}.yaml").read_text()
     controller = FlightController(params)  # which refuses a drone that cannot hover
-    assert (4 * controller.thrust_max >= params.max_thrust_to_weight * params.mass * params.gravity).all()
+    thrust = len(params.rotor_spin) * controller.thrust_max
+    assert (thrust >= params.max_thrust_to_weight * params.mass * params.gravity).all() and "# Source: " in text
+    loop = rate_loop(params, 0.005)
+    assert loop.is_stable.all() and (loop.damping_ratio >= (0.8 if "suggest_gains" in text else 0.54)).all()
+
+
+def test_a_geometric_controller_hovers_every_preset():
+    drones = {name: load_drone(name) for name in available_drones()}
+    for rotors in {len(drone.rotor_spin) for drone in drones.values()}:
+        some = [drone.replace(motor_time_constant=drone.motor_time_constant.expand(2)) for drone in drones.values()]
+        some = [drone.fields() for drone in some if len(drone.rotor_spin) == rotors]
+        params = QuadrotorParams(**{name: torch.stack([fields[name] for fields in some]) for name in some[0]})
+        env = HoveringEnv(num_envs=len(some), drone=params, seed=0)
+        policy = GeometricController(env, position_gain=4.0, velocity_gain=3.0)
+        with torch.no_grad():
+            flight = env.rollout(200, policy, break_when_any_done=False)
+        assert flight["next", "success"][:, -50:].all()
 
 
 def test_a_drone_comes_from_a_file_or_a_mapping_as_well(tmp_path):
@@ -81,7 +99,7 @@ def test_what_is_no_drone_is_refused_by_name(tmp_path):
         (lambda: load_drone("visfly", torch.int64), "dtype must be torch.float32 or torch.float64"),
     ):
         refuses(message, make)
-    with pytest.raises(FileNotFoundError, match="No drone file at .*none.yaml. Choose from: crazyflie"):
+    with pytest.raises(FileNotFoundError, match="No drone file at .*none.yaml. Choose from: cf2p"):
         load_drone(tmp_path / "none.yaml")
 
 
@@ -203,3 +221,159 @@ def test_what_is_no_number_is_refused_in_every_field_however_a_drone_is_made(val
     motors = {"speed_per_volt": 500.0, "nominal_voltage": 3.7, "speed_at_zero": 0.0, "delay": 0.0}
     for name in motors:
         refuses(name, load_drone, {**VISFLY, "motor_command": {**motors, name: value}}, error=UserValueError)
+
+
+# -- files of other projects -------------------------------------------------------------------------------------------
+
+MOTOR = {"timeConstantUp": 0.0125, "timeConstantDown": 0.025, "maxRotVelocity": 1000, "momentConstant": 0.02}
+MOTOR |= {"motorConstant": 1e-5, "rotorDragCoefficient": 1e-4}
+CORNERS = ((0.2, -0.1), (-0.2, 0.1), (0.2, 0.1), (-0.2, -0.1))
+J = "<inertia><ixx>0.01</ixx><iyy>0.02</iyy><izz>0.025</izz></inertia>"
+
+
+def sdf(content):
+    return f"<sdf version='1.9'><model name='x'>{content}</model></sdf>"
+
+
+def motors(**changes):
+    """Of an SDF: of four rotors, the first of which may differ."""
+    turns = ({"turningDirection": x} for x in ("ccw", "ccw", "cw", "cw"))
+    said = [MOTOR | {"linkName": f"rotor_{i}", "motorNumber": i} | x for i, x in enumerate(turns)]
+    said[0] |= changes
+    return "".join(f"<plugin>{''.join(f'<{k}>{v}</{k}>' for k, v in x.items())}</plugin>" for x in said)
+
+
+FRAME = f"<link name='base_link'><inertial><mass>1</mass>{J}</inertial></link>" + "".join(
+    f"<joint name='j{i}'><pose relative_to='base_link'>{x} {y} 0.1 0 0 0</pose></joint><link name='rotor_{i}'>"
+    f"<pose relative_to='j{i}'/><inertial><mass>0.25</mass></inertial></link>"
+    for i, (x, y) in enumerate(CORNERS)
+)
+URDF = (
+    "<robot name='{}'><properties kf='1e-9' km='2e-11' thrust2weight='2' drag_coeff_xy='1e-6'/><link name='base_link'>"
+    "<inertial><mass value='0.4'/><inertia ixx='1e-3' ixy='{}' iyy='1e-3' izz='1.5e-3'/></inertial></link>"
+    + "".join(
+        f"<link name='prop{i}_link'><inertial><origin xyz='{CORNERS[k][0]} {CORNERS[k][1]} 0'/></inertial></link>"
+        for i, k in enumerate((0, 3, 1, 2))
+    )
+    + "</robot>"
+)
+L2F = {"mass": 1.0, "gravity": [0, 0, 9.8], "J": np.diag([0.01, 0.01, 0.015]).tolist(), "action_limit": [0, 1]}
+L2F |= {"rotor_positions": [[x, -y, 0] for x, y in CORNERS], "rotor_thrust_directions": [[0, 0, -1]] * 4}  # z is down
+L2F |= {"rotor_torque_directions": [[0, 0, x] for x in (1, 1, -1, -1)], "rotor_torque_constants": [0.02] * 4}
+L2F |= {"rotor_thrust_coefficients": [[0.1, 0.5, 5.0]] * 4, "rotor_time_constants_rising": [0.03] * 4}
+L2F |= {"rotor_time_constants_falling": [0.06] * 4}
+HEXAGON = [[0.2 * np.cos(x), 0.2 * np.sin(x), 0.0] for x in np.arange(6) * np.pi / 3]
+ROTORPY = {
+    "mass": 1.0,
+    "Ixx": 0.01,
+    "Iyy": 0.01,
+    "Izz": 0.015,
+    "rotor_pos": {f"r{i}": x for i, x in enumerate(HEXAGON)},
+}
+ROTORPY |= {"rotor_directions": [1, -1] * 3, "k_eta": 1e-5, "k_m": 2e-7, "k_d": 1e-4, "k_z": 2e-4, "tau_m": 0.02}
+ROTORPY |= {"rotor_speed_min": 0, "rotor_speed_max": 900, "c_Dx": 0.01, "c_Dy": 0.01, "c_Dz": 0.02}
+MODELS = {"mass": 0.03, "L": 0.03, "J": np.diag([1e-5, 1e-5, 1.9e-5]).tolist(), "thrust_tau": 0.05, "thrust_max": 0.12}
+MODELS |= {"rpm2thrust": [0, 0, 4e-10], "rpm2torque": [0, 0, 8e-12]}
+MODELS |= {"mixing_matrix": [[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]]}
+TOML = "\n".join(f"[{x}]\n" + "\n".join(f"{k} = {v}" for k, v in MODELS.items()) for x in "ab")
+AGILICIOUS = {"mass": 0.75, "tbm_fr": [0.2, -0.1, 0], "tbm_bl": [-0.2, 0.1, 0], "tbm_br": [-0.2, -0.1, 0]}
+AGILICIOUS |= {"tbm_fl": [0.2, 0.1, 0], "inertia": [0.0025, 0.0021, 0.0043], "motor_omega_min": 150, "motor_tau": 0.033}
+AGILICIOUS |= {"motor_omega_max": 2000, "kappa": 0.022, "thrust_max": 8, "aero_coeff_1": [0.1, 0.1, 0.2]}
+AGILICIOUS |= {"omega_max": [10, 10, 4]}
+FLIGHTMARE = "quadrotor_dynamics: {mass: 0.73, arm_l: 0.17, thrust_map: [1.3e-6, 0, 0], kappa: 0.016, motor_tau: 0.03}"
+HOVER, FAST = np.sqrt(9.81 * 2 / 4 / 1e-5), 2 * np.pi / 60  # of a rotor of the SDF [rad/s]; of one rpm
+
+
+@cases(
+    ("x.sdf", sdf(FRAME + motors()), {}, {"mass": 2.0, "inertia": [0.025, 0.065, 0.075],
+     "rotor_positions": CORNERS, "rotor_spin": [-1, -1, 1, 1], "motor_time_constant": [0.0125, 0.025],
+     "thrust_map": [1e-5, 0, 0], "linear_drag": [4e-4 * HOVER, 4e-4 * HOVER, 0]}),
+    ("x.urdf", URDF.format("racer", 0), {"motor_time_constant": 0.05}, {
+     "rotor_positions": [CORNERS[i] for i in (0, 3, 1, 2)],
+     "rotor_spin": [1, -1, 1, -1], "thrust_map": [1e-9 / FAST**2, 0, 0], "yaw_torque_coefficient": 0.02,
+     "rotor_speed_max": np.sqrt(2 * 0.4 * 9.81 / 4e-9) * FAST, "motor_time_constant": 0.05}),
+    ("x.json", json.dumps({"dynamics": L2F}), {"linear_drag": [0.1] * 3}, {"rotor_positions": CORNERS, "gravity": 9.8,
+     "rotor_spin": [-1, -1, 1, 1], "thrust_map": [5e-6, 5e-4, 0.1], "motor_time_constant": [0.03, 0.06]}),
+    ("x.json", json.dumps(ROTORPY), {}, {"rotor_positions": np.array(HEXAGON)[:, :2], "rotor_spin": [1, -1] * 3,
+     "yaw_torque_coefficient": 0.02, "quadratic_drag": [0.01, 0.01, 0.02],
+     "linear_drag": 6 * np.sqrt(9.81 / 6e-5) * np.array([1e-4, 1e-4, 2e-4])}),
+    ("x.toml", TOML, {"entry": "b", "linear_drag": [0.01] * 3}, {"rotor_spin": [-1, 1, -1, 1], "mass": 0.03,
+     "rotor_positions": 0.03 * np.array([[1, -1], [-1, -1], [-1, 1], [1, 1]]),
+      "yaw_torque_coefficient": 0.02, "rotor_speed_max": np.sqrt(0.12 / 4e-10) * FAST}),
+    ("x.yaml", json.dumps(AGILICIOUS), {}, {"rotor_positions": [CORNERS[i] for i in (0, 1, 3, 2)],
+     "rotor_spin": [-1, -1, 1, 1], "thrust_map": [2e-6, 0, 0], "max_body_rate": [10, 10, 4],
+     "linear_drag": [0.1, 0.1, 0.2]}),
+    ("x.yaml", FLIGHTMARE, {"linear_drag": [0.1] * 3, "rotor_speed_max": 3000}, {"rotor_spin": [1, -1, 1, -1],
+     "inertia": [0.00791138, 0.00791138, 0.01230658]}),
+)  # fmt: skip
+def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_theirs(
+    file, text, given, wanted, tmp_path
+):
+    path = tmp_path / file
+    path.write_text(text)
+    drone = load_drone(path, torch.float64, **given)
+    for name, value in wanted.items():
+        np.testing.assert_allclose(getattr(drone, name).squeeze(), np.asarray(value, float), rtol=1e-5, err_msg=name)
+    written = tmp_path / "ours.yaml"
+    written.write_text(import_drone(path, **given))
+    for name, value in load_drone(written, torch.float64).fields().items():
+        torch.testing.assert_close(value, getattr(drone, name), rtol=1e-6, atol=1e-12)
+    assert written.read_text().startswith(f"# Source: {file}") and "chosen here: suggest_gains" in written.read_text()
+    assert all(
+        f"{x}: " in written.read_text() and "given, not in the file" in written.read_text()
+        for x in given
+        if x != "entry"
+    )
+    assert HoveringEnv(num_envs=1, drone=str(written)).nominal.mass.item() == pytest.approx(drone.mass.item())
+
+
+@cases(
+    (
+        "x.sdf",
+        sdf(FRAME),
+        r"does not say rotor_spin \[1\], yaw_torque_coefficient \[m\], thrust_map .*, motor_time_constant",
+    ),
+    (
+        "x.urdf",
+        URDF.format("cf", 0),
+        r"\(URDF.*\) does not say motor_time_constant \[s\]. Give .*motor_time_constant=0.03\)",
+    ),
+    ("x.urdf", URDF.format("cf", 4e-4), r"inertia \[kg m2\]: its products of inertia are not small, 0.0004 kg m2"),
+    (
+        "x.sdf",
+        sdf(FRAME + motors(motorConstant=2e-5)),
+        "rotors differ in motorConstant",
+    ),
+    ("x.sdf", sdf("<include><uri>model://other</uri></include>"), "includes the model 'other': put it at "),
+    ("x.urdf", "<!DOCTYPE x [<!ENTITY a 'b'>]><robot>&a;</robot>", "declares entities or a type"),
+    ("x.sdf", sdf(FRAME.replace("0.02<", "much<")), "expected 1 number, got 'much'"),
+    ("x.xml", "<mujoco/>", "XML with the root <mujoco> is no URDF or SDF .* These can be read: URDF"),
+    ("x.json", "[1]", "this file is of no kind that is known. These can be read"),
+    (
+        "x.json",
+        json.dumps({"dynamics": {**L2F, "rotor_positions": [1, 2]}}),
+        r"'rotor_positions' has shape \(2,\); it must be",
+    ),
+    ("x.toml", TOML, r"choose one drone of the file, by entry='a' or another of"),
+    ("x.xacro", "", "a .xacro file has to be run before its numbers can be read. Expand it first"),
+    ("x.toml", "[cf2x]\nacc_coef = 1", "this file is of no kind that is known. These can be read"),
+    ("x.stl", "", "no drone can be read from a .stl file. These can be read"),
+    ("x.yaml", "mass: 1", "is no file of another project"),
+)
+def test_what_cannot_become_a_drone_is_refused_with_all_that_is_missing(file, text, message, tmp_path):
+    (tmp_path / file).write_text(text)
+    refuses(message, import_drone, tmp_path / file)
+
+
+def test_the_recipe_writes_a_drone_from_a_model_and_what_it_includes(tmp_path, monkeypatch, capsys):
+    script = Path(__file__).parents[1] / "recipes/import_drone.py"
+    (tmp_path / "frame.sdf").write_text(sdf(FRAME))
+    (tmp_path / "x.sdf").write_text(sdf(f"<include><uri>model://frame</uri></include>{motors()}"))
+    monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "x.sdf"), "mass=3", f"output={tmp_path}/o/x.yaml"])
+    runpy.run_path(str(script), run_name="__main__")
+    assert load_drone(tmp_path / "o/x.yaml").mass == 3.0 and f"env.drone={tmp_path}/o/x.yaml" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "frame.sdf")])
+    with pytest.raises(SystemExit):
+        runpy.run_path(str(script), run_name="__main__")
+    advice = re.search(r"load_drone\(.*\)(?=, or)", capsys.readouterr().err)[0]
+    assert HoveringEnv(num_envs=1, drone=eval(advice)).nominal.mass.item() == 2.0

@@ -5,12 +5,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from flying import FLOWN
 from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 
 from torchrl_quad import HoveringEnv
 from torchrl_quad.deploy.simulators import vehicle
-from torchrl_quad.dynamics import FlightController, Quadrotor, available_drones, load_drone, quaternion, rigid_body
+from torchrl_quad.dynamics import FlightController, Quadrotor, load_drone, quaternion, rigid_body
 from torchrl_quad.dynamics.control import Setpoint
 from torchrl_quad.dynamics.gains import rate_loop
 from torchrl_quad.dynamics.model import QuadrotorState
@@ -165,7 +166,7 @@ def test_allocation_is_r_cross_f_for_any_layout(tilted):
     torch.testing.assert_close(worn @ thrust, rigid_body.allocation_matrix(params) @ (share * thrust))
 
 
-@pytest.mark.parametrize("name", available_drones())
+@pytest.mark.parametrize("name", FLOWN)
 def test_a_body_rate_command_turns_the_drone_that_way(name):
     params = drone(name, drag_height=0.0)  # a drag moment that changes with the speed disturbs the loop
     controller = FlightController(params)
@@ -178,7 +179,7 @@ def test_a_body_rate_command_turns_the_drone_that_way(name):
 
 
 @pytest.mark.parametrize("dt", [5e-4, 5e-3, 1e-2])
-@pytest.mark.parametrize("name", available_drones())
+@pytest.mark.parametrize("name", FLOWN)
 def test_the_rate_loop_is_damped_as_its_poles_say_in_the_steps_that_are_flown(name, dt):
     params = drone(name, drag_height=0.0)
     controller = FlightController(params)
@@ -206,7 +207,7 @@ FALLING_SLOPE = {"thrust_map": [-2.0, 8.0, 0.1], "rotor_speed_min": 0.0, "rotor_
 
 
 @pytest.mark.parametrize("changes", [{}, FALLING_SLOPE, {**FALLING_SLOPE, "thrust_map": [0.01, 6.0, -0.1]}])
-@pytest.mark.parametrize("name", available_drones())
+@pytest.mark.parametrize("name", FLOWN)
 def test_the_thrust_map_and_its_inverse_agree_over_the_speed_range(name, changes):
     params = drone(name, **changes)
     rotors, apart = (
@@ -268,7 +269,7 @@ def test_components_fly_as_tensors_do_with_two_time_constants_and_drag_above_the
 
 # -- where rotors saturate: yaw gives way first, and nothing changes where they do not ---------------------------------
 
-each_drone = pytest.mark.parametrize("controller", available_drones(), indirect=True)
+each_drone = pytest.mark.parametrize("controller", FLOWN, indirect=True)
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from torchrl.objectives import ValueEstimators
 
 from torchrl_quad import HoveringEnv, HybridLoss, differentiable_rollout, make_actor, make_qvalue, make_value
 from torchrl_quad.objectives import ABPTLoss, AHACLoss, SAPOLoss, SHACLoss
-from torchrl_quad.objectives.calls import distribution_again
+from torchrl_quad.objectives.calls import plain_of
 
 ENTROPY = [-3.0, -1.0, 1.0, 3.0]  # of the four steps, in both environments
 
@@ -289,7 +289,7 @@ def test_the_entropy_is_that_of_the_tanh_normal(env):
     torch.manual_seed(1)
     losses = loss(data)
     torch.manual_seed(1)
-    parameters = distribution_again(loss.actor_network, loss.actor_network_params, data)
+    parameters = plain_of(loss.actor_network, data).distribution(data)
     slope = 1.0 - TanhNormal(*parameters).rsample().square()  # of the tanh
     entropy = (Normal(*parameters).entropy() + slope.log()).sum(-1)
     assert set(losses.keys()) == set(loss.out_keys)

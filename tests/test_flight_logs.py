@@ -29,6 +29,12 @@ def table():
     return {name: rows[name] for name in rows.dtype.names}
 
 
+@pytest.fixture(scope="module")
+def plain(table, tmp_path_factory):
+    """The flight as it is."""
+    return read_log(write_csv(tmp_path_factory.mktemp("plain") / "flight.csv", table))
+
+
 @pytest.fixture
 def read(table, tmp_path):
     """Reads the flight with some columns changed."""
@@ -80,7 +86,7 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
     "gyro in degrees": (
         lambda t: scaled(t, GYRO, 180 / np.pi),
         "WrongUnit",
-        "imu_gyro_x.*degrees/s. Write .*pi / 180",
+        "imu_gyro_x.*degrees/s. Write .*0.0174",
     ),
     "gyro in milliradians": (lambda t: scaled(t, GYRO, 1e3), "WrongUnit", "imu_gyro_x.*milliradians"),
     "gyro three times too fast": (lambda t: scaled(t, GYRO, 6.0), "WrongUnit", "times the derivative"),
@@ -95,7 +101,7 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
         "px.*millimetres.*0.001.*vx.*0.001",
     ),
     "mixed lengths": (lambda t: scaled(t, SPEED, 1e3), "WrongUnit", "vx, vy, vz.*1e\\+03 times"),
-    "z down": (lambda t: scaled(t, ("pz", "vz"), -1), "WrongFrame", "z points down. If only z.*scale=.1, 1, -1"),
+    "z down": (lambda t: scaled(t, ("pz", "vz"), -1), "WrongFrame", "z points down. If only z.*scale=.1.0, 1.0, -1"),
     "accelerometer down": (
         lambda t: scaled(t, FORCE[2:], -1),
         "WrongFrame",
@@ -160,7 +166,7 @@ def test_a_tracker_that_jumps_is_cut_out(table, read):
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_each_fault_has_its_name_and_its_remedy(fault, table, read):
+def test_each_fault_has_its_name_and_its_remedy(fault, table, plain, read):
     change, error, message = FAULTS[fault]
     with pytest.raises(LogError, match=message) as caught:
         read(change(table))
@@ -171,24 +177,24 @@ def test_each_fault_has_its_name_and_its_remedy(fault, table, read):
         motors = [] if "rotor_speed" in told[1] else ["motor_command"]
         if "scale" in told[1]:
             for name in ("angular_velocity", "acceleration", "position", "velocity", *motors):
-                np.testing.assert_allclose(getattr(mended, name), getattr(read(), name), atol=1e-3, err_msg=name)
+                np.testing.assert_allclose(getattr(mended, name), getattr(plain, name), atol=1e-3, err_msg=name)
     assert bool(told) == (fault not in HOPELESS)
 
 
-def test_without_a_gyro_the_lean_of_the_drone_tells_a_wrong_quaternion(table, read):
+def test_without_a_gyro_the_lean_of_the_drone_tells_a_wrong_quaternion(table, plain, read):
     log = read(drop=GYRO)
     assert "no gyro: angular_velocity was derived from the attitude" in log.notes
     assert "angular_velocity" not in log.onboard
-    assert np.corrcoef(log.angular_velocity[300:800, 1], read().angular_velocity[300:800, 1])[0, 1] > 0.7
+    assert np.corrcoef(log.angular_velocity[300:800, 1], plain.angular_velocity[300:800, 1])[0, 1] > 0.7
     for fault in ("world to body", "scalar first"):
         with pytest.raises(LogError, match="leans where the drone accelerates.*Write columns=") as caught:
             read(FAULTS[fault][0](table), drop=GYRO)
         assert type(caught.value).__name__ == "WrongQuaternion"
 
 
-def test_gaps_a_lost_tracker_and_a_frozen_one_separate_pieces(table, read):
+def test_gaps_a_lost_tracker_and_a_frozen_one_separate_pieces(table, plain, read):
     t = table["t"]
-    whole = read().segments
+    whole = plain.segments
     assert len(whole) == 1
     lost = (t > 4.0) & (t < 4.5)
     held = np.searchsorted(t, 4.0)
@@ -224,17 +230,17 @@ def test_repeated_times_a_missing_battery_and_an_impact_are_told(table, read):
     assert b * log.dt == pytest.approx(hit - 0.1, abs=0.03) and c * log.dt == pytest.approx(hit + 0.3, abs=0.05)
 
 
-def test_a_mapping_replaces_entries_of_a_preset_and_nothing_else(table, read):
+def test_a_mapping_replaces_entries_of_a_preset_and_nothing_else(table, plain, read):
     renamed = {"volts": table["pwr_pm_vbat"], "motor_motor_m5": table["t"]}
     log = read(renamed, drop=("pwr_pm_vbat", "sp_ctrltarget_yaw"), columns={"battery_voltage": "volts"})
-    np.testing.assert_array_equal(log.battery_voltage, read().battery_voltage)
+    np.testing.assert_array_equal(log.battery_voltage, plain.battery_voltage)
     assert "motor_motor_m5 looks like a fifth motor" in str(log)
     assert set(log.setpoint) == {"position"}  # what the preset knows and the file lacks is left out, as ever
 
 
-def test_the_delay_of_the_on_board_clock_is_seen_and_left_to_the_fit(table, read):
+def test_the_delay_of_the_on_board_clock_is_seen_and_left_to_the_fit(table, plain, read):
     lag = 8  # samples
-    plain, shifted = read(), read({name: np.roll(table[name], lag) for name in (*GYRO, *FORCE, *MOTORS)})
+    shifted = read({name: np.roll(table[name], lag) for name in (*GYRO, *FORCE, *MOTORS)})
     told = [float(str(log).split("correlation")[1].split("ms late")[0].split()[1]) for log in (plain, shifted)]
     assert told[1] - told[0] == pytest.approx(80.0, abs=8.0)
     np.testing.assert_allclose(shifted.angular_velocity[lag:-lag], plain.angular_velocity[: -2 * lag], atol=1e-9)
@@ -340,6 +346,9 @@ def test_euler_angles_and_velocities_of_the_body_become_ours(tmp_path):
     inside = slice(*log.segments[0])
     np.testing.assert_allclose(log.velocity[inside], true["velocity"][inside], atol=0.02)
     assert log.acceleration is None and log.setpoint is None
+    twisted = {k: v for k, v in TABLE.items() if k != "quaternion"} | {"euler": OURS["angular_velocity"]}
+    write_csv(path, own_table(t))
+    refuses("does not follow euler .*belong together.$", read_log, path, twisted, error=WrongFrame)  # no order mends it
 
 
 HUGE = 10**400  # more than a float holds

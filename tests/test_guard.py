@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-from flying import fly
+from flying import FLOWN, fly
 from refusals import cases, refuses
 from tensordict import TensorDict
 
-from torchrl_quad import HoveringEnv, available_drones, differentiable_rollout, load_drone, make_actor, make_env
+from torchrl_quad import HoveringEnv, differentiable_rollout, load_drone, make_actor, make_env
 from torchrl_quad.dynamics import INTEGRATORS
 
 nan = float("nan")
@@ -34,7 +34,7 @@ def gradients_of_the_first(env, key=None, value=None):
     return torch.cat([g.flatten() for g in grads if g is not None]), crashes
 
 
-@pytest.mark.parametrize("drone", available_drones())
+@pytest.mark.parametrize("drone", FLOWN)
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_a_neighbour_that_breaks_does_not_reach_what_all_share(drone, integrator):
     env = HoveringEnv(num_envs=2, drone=drone, integrator=integrator, action_delay=0)

@@ -39,6 +39,13 @@ def real():
     return read_log(REAL)
 
 
+@pytest.fixture
+def rough(monkeypatch):
+    """Fits read every other sample, and less of what was before a window."""
+    monkeypatch.setattr(prediction, "SAMPLE", 0.02)
+    monkeypatch.setattr(prediction, "WARM_UP", 0.2)
+
+
 def test_a_fit_finds_the_drone_of_a_simulated_flight_and_writes_files_that_fly(simulated, tmp_path, capsys):
     log, truth = simulated
     start = benchmark.start(0, truth)
@@ -80,6 +87,7 @@ def test_a_fit_finds_the_drone_of_a_simulated_flight_and_writes_files_that_fly(s
     assert report["parameters"]["inertia.x"]["value"] == found["inertia.x"]["value"]
 
 
+@pytest.mark.usefixtures("rough")
 def test_a_fit_that_was_stopped_goes_on_as_if_it_had_not(real, tmp_path, monkeypatch, capsys):
     file, write = tmp_path / "checkpoint.json", estimation.Checkpoint.write
     options = {"fields": ["linear_drag"], "draws": 0, "iterations": 9} | BRIEF
@@ -116,6 +124,7 @@ def test_a_checkpoint_is_of_one_flight_only(real):
     assert len(set(changed.values())) == len(changed)
 
 
+@pytest.mark.usefixtures("rough")
 def test_what_a_flight_does_not_tell_gets_no_number_but_a_reason(simulated):
     log, truth = simulated
     level = {"quaternion": np.tile([1.0, 0.0, 0.0, 0.0], (len(log.time), 1)), "onboard": ()}
@@ -227,11 +236,35 @@ def test_arguments_of_fits_and_predictions_are_refused_in_one_line_and_a_flight_
         refuses(name, dataclasses.replace, real, error=UserError, **{name: value})
 
 
+@pytest.mark.usefixtures("rough")
+def test_what_contradicts_the_drone_is_found_and_no_inertia_is_one_that_no_body_has(real):
+    short, options = dataclasses.replace(real, segments=((300, 700),)), {"fields": ["linear_drag"], "draws": 0} | BRIEF
+    turned = "the other way than the drone's.*Write rotor_spin: .1, -1, 1, -1. in the drone"
+    refuses(turned, identify, short, "crazyflie", {"rotor_spin": [-1, 1, -1, 1]}, **options)
+    heavy = r"left over .*mass of 0.06 kg or its thrust.*name \"thrust_map\" in fields"
+    refuses(heavy, identify, short, "crazyflie", {"mass": 0.06}, iterations=1, **options)
+    result = identify(short, iterations=1, **options)
+    assert max(map(abs, result.trim["force_per_weight"])) < 0.1 and set(result.errors_by_flight) == {"figure8"}
+    worse = {**result.errors, "fitted": {name: {0.2: 9.0} for name in result.errors["fitted"]}}
+    assert "the fit predicts worse than constant velocity: position (9 against" in dataclasses.replace(
+        result, errors=worse).verdict  # fmt: skip
+    prior = load_drone("crazyflie", torch.float64)
+    for free, steps in (
+        (("roll", "pitch", "z_ratio"), ([0.3, -0.4, 20.0], [0.3, -0.4, -20.0])),
+        (("roll",), ([3.0], [-3.0])),
+    ):
+        model = Model(prior, prior.motor_command, free)
+        for step in steps:
+            inertia = model.params(model.bounded(model.start + torch.tensor(step, dtype=torch.float64))).inertia
+            assert 2.0 * inertia.max() <= inertia.sum() * (1.0 + 1e-9)
+
+
 BROKEN = ("{", "[]", "5", '{"stages": 5}', "[" * 100_000, "\xff", '{"fingerprint": "F", "stages": 5}')
 DRAG = {"free": ["drag_xy", "drag_z"]}
 BROKEN_STAGES = (5, {}, {"free": 5}, DRAG, DRAG | {"x": [0], "streams": [0]})
 
 
+@pytest.mark.usefixtures("rough")
 def test_a_checkpoint_that_is_damaged_is_refused_and_named(real, tmp_path):
     file, short = tmp_path / "checkpoint.json", dataclasses.replace(real, segments=((300, 700),))
     options = {"fields": ["linear_drag"], "draws": 0, "iterations": 1, "checkpoint": file} | BRIEF
@@ -247,6 +280,7 @@ def test_a_checkpoint_that_is_damaged_is_refused_and_named(real, tmp_path):
             identify(short, **options)
 
 
+@pytest.mark.usefixtures("rough")
 def test_the_recipe_fits_a_real_flight_and_draws_it(launch, refused, tmp_path):
     (tmp_path / "own.csv").write_text(gzip.decompress(REAL.read_bytes()).decode().replace("pwr_pm_vbat", "volts"))
     own = ["columns={battery_voltage: {names: [volts], scale: 1.0}}", "convention=crazyflie"]

@@ -16,7 +16,7 @@ UNWRAP = "data.unwrap"  # the one helper that networks and pictures share with d
 TORCHRL = {"torch", "torchrl", "tensordict"}
 # What each part of the package may import: of the others, parts or single modules, and which libraries.
 ALLOWED = {
-    "dynamics": ({"allocation", "airframe"}, {"torch", "numpy", "yaml"}),
+    "dynamics": ({"airframe"}, {"torch", "numpy", "yaml"}),
     "engine": (set(), {"torch", "tensordict"}),
     "vision": ({"dynamics", "engine"}, {"torch"}),
     "envs": ({"dynamics", "engine", "rotations", "vision"}, {*TORCHRL, "gymnasium", "numpy", "pydantic"}),
@@ -27,14 +27,13 @@ ALLOWED = {
     ),
     "modules": ({UNWRAP}, TORCHRL),
     "objectives": ({UNWRAP}, TORCHRL),
-    "data": (set(), TORCHRL),
+    "data": ({"engine"}, TORCHRL),
     "deploy": (
-        {"allocation", "data", "dynamics", "engine", "envs", "files", "airframe", "rotations", "vision"},
+        {"data", "dynamics", "engine", "envs", "files", "airframe", "rotations", "vision"},
         {*TORCHRL, "jsonschema", "numpy", "onnx", "onnxruntime", "onnxscript", "mujoco", "rotorpy", "crazyflow", "jax"},
     ),
     "airframe": (set(), {"numpy"}),
     "rotations": (set(), {"numpy"}),
-    "allocation": (set(), {"numpy"}),
     "errors": (set(), set()),
     "options": (set(), {"numpy", "pydantic", "torch"}),
     "files": (set(), {"filelock"}),
@@ -46,7 +45,7 @@ ALLOWED = {
     ),
     "adapters": ({"envs"}, {*TORCHRL, "gymnasium", "numpy", "rsl_rl", "skrl", "stable_baselines3"}),
     "identification": (
-        {"allocation", "deploy.frames", "dynamics", "files", "render.canvas", "rotations"},
+        {"airframe", "deploy.frames", "dynamics", "files", "render.canvas", "rotations"},
         {"torch", "numpy", "yaml", "pydantic", "pydantic_core", "rosbags", "lz4", "backports", "compression"},
     ),
 }
@@ -109,7 +108,7 @@ def test_every_part_is_covered_none_import_in_a_circle_and_each_exception_is_an_
 def test_the_picture_has_every_part_and_its_arrows_lead_to_parts_that_import_where_they_begin():
     picture = (ROOT / "docs/images/architecture.svg").read_text()
     boxes = {name.strip("/").removesuffix(".py") for name in re.findall(r'class="name"[^>]*>([\w.]+/?)', picture)}
-    tools = {"errors", "options", "files", "rotations", "allocation", "airframe"}
+    tools = {"errors", "options", "files", "rotations", "airframe"}
     assert boxes - {"recipes"} == set(ALLOWED) - tools
     imports = {(part_of(name), part_of(module)) for module in MODULES for name in imported_modules(module)}
     arrows = {tuple(arrow.split("-")) for arrow in re.findall(r'class="flow" id="([\w-]+)"', picture)}

@@ -3,6 +3,7 @@
 import csv
 import json
 import struct
+import sys
 from collections import Counter
 
 import pytest
@@ -11,10 +12,20 @@ from conftest import RECIPES
 from omegaconf import OmegaConf
 from refusals import cases
 from small_runs import EVERYTHING, SMALL, assert_equal, poison, rows, stop_at_save
+from torchrl import torchrl_logger
 
 from torchrl_quad.training import loop
 from torchrl_quad.training.checkpoints import read_checkpoint, revision
 from torchrl_quad.training.configuration import hydra_argument
+
+
+def test_what_torchrl_says_while_a_run_trains_goes_above_its_bar(train, tmp_path, monkeypatch):
+    record, said = loop.Run.record, []
+    monkeypatch.setattr(torchrl_logger.handlers[0], "stream", sys.stderr)  # pytest has replaced it since
+    monkeypatch.setattr(loop.tqdm, "write", lambda text, **_: said.append(text))
+    monkeypatch.setattr(loop.Run, "record", lambda *run, **rest: [torchrl_logger.info("told"), record(*run, **rest)])
+    train("bptt", tmp_path, "total_steps=24")
+    assert said and all("told" in text for text in said)
 
 
 def test_wandb_gets_configuration_metrics_pictures_films_replay_and_artifact(launch, tmp_path):

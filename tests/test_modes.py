@@ -5,12 +5,12 @@ import math
 
 import pytest
 import torch
-from flying import fly
+from flying import FLOWN, fly
 from refusals import cases, refuses
 from scipy.spatial.transform import Rotation
 from torchrl.envs import check_env_specs
 
-from torchrl_quad import HoveringEnv, available_drones, load_drone, make_actor, make_env
+from torchrl_quad import HoveringEnv, load_drone, make_actor, make_env
 from torchrl_quad.adapters.gym import GymVectorEnv
 from torchrl_quad.dynamics import CONTROLS, DYNAMICS, quaternion
 from torchrl_quad.envs import TASKS
@@ -18,10 +18,10 @@ from torchrl_quad.envs import TASKS
 F64 = torch.float64
 DT, STEPS = 0.005, 4  # physics step [s], and how many make a control step
 each_mode = pytest.mark.parametrize("control", CONTROLS)
-each_drone = pytest.mark.parametrize("drone", available_drones())
+each_drone = pytest.mark.parametrize("drone", FLOWN)
 MODELS = set(itertools.product(CONTROLS, DYNAMICS)) - {("rotor_thrusts", "point_mass")}
 each_model = pytest.mark.parametrize(("control", "dynamics"), sorted(MODELS))
-each_flight = cases(*((name, "quadrotor") for name in available_drones()), ("visfly", "point_mass"))
+each_flight = cases(*((name, "quadrotor") for name in FLOWN), ("visfly", "point_mass"))
 
 
 def commanded(steps, *commands, control, drone="visfly", **options):

@@ -312,7 +312,7 @@ def test_a_rollout_with_its_graph_in_double_precision_is_written_under_transform
 
 
 def test_randomised_drones_are_drawn_with_their_own_rotors():
-    randomize = {"rotor_positions": {"scale": [0.5, 2.0]}, "mass": {"scale": [0.5, 2.0]}}
+    randomize = {"rotor_positions": {"scale": [0.8, 2.0]}, "mass": {"scale": [0.5, 2.0]}}
     env = HoveringEnv(num_envs=3, randomize=randomize)
     rollout = env.rollout(5, break_when_any_done=False)
     _, numbers = written(rollout, env=env)
@@ -335,6 +335,25 @@ def test_the_gate_of_a_frame_is_the_one_that_the_drone_flies_to_and_rings_face_a
     torch.testing.assert_close(rings.norm(dim=-1), torch.full((4, 33), 0.5))
     along = env.gates.roll(-1, 0) - env.gates.roll(1, 0)  # of a square, between the edges before and after
     torch.testing.assert_close((rings * along[:, None]).sum(-1), torch.zeros(4, 33), atol=1e-5, rtol=0)
+
+
+def test_each_drone_has_the_gates_of_its_own_episode_with_their_openings_and_frames(tmp_path, open_page):
+    env = RacingEnv(num_envs=2, track={"file": "random", "frame": 0.25})
+    rollout = env.rollout(4, break_when_any_done=False)
+    rims = written(rollout, env=env)[1]("gates", 2, 6, 33, 3)
+    drawn = rollout["state", "track"][:, 0]
+    away = (rims - drawn["gates"].unsqueeze(2)).norm(dim=-1)
+    torch.testing.assert_close(away.amax((1, 2)), torch.full((2,), 0.75 * 2**0.5))  # the corners of 1.5 m by 1.5 m
+    write_replay(rollout, tmp_path / "replay.html", env=env)
+    replay = open_page(tmp_path / "replay.html")
+    for i in (0, 1):
+        replay.page.select_option("#environment", str(i))
+        points = torch.from_numpy(replay.trace("gates")).float()
+        torch.testing.assert_close(points[~points[:, 0].isnan()], rims[i].flatten(0, 1))
+        bars = torch.from_numpy(replay.trace("shape 0")).float()
+        from_centre = (bars[~bars[:, 0].isnan()].reshape(6, 33, 3) - drawn["gates"][i, :, None]).norm(dim=-1)
+        torch.testing.assert_close(from_centre.amax(1), torch.full((6,), 2**0.5))
+    replay.close()
 
 
 def test_a_page_of_twelve_long_flights_is_small_and_a_machine_without_plotly_is_told_what_to_install(monkeypatch):

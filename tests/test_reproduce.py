@@ -215,6 +215,11 @@ def test_recipes_are_flown_as_they_ship_and_what_is_there_is_not_flown_again(flo
         run_main(monkeypatch, reproduce, "shipped --tasks window --data", tmp_path)
 
 
+def test_abpt_hovers_every_drone_that_is_asked_for(flown):
+    (row,) = flown("drones --drones cf2x --seeds 0")
+    assert (row["drone"], row["algorithm"], row["task"], row["steps"]) == ("cf2x", "abpt", "hovering", "64")
+
+
 def test_options_are_changed_one_at_a_time_and_shown_beside_what_ships(flown, tmp_path):
     (row,) = flown("ablations --tasks landing --methods bptt --changes 'event times' clip --seeds 0")
     assert (row["change"], row["algorithm"], row["steps"]) == ("clip", "bptt", "64")

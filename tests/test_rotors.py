@@ -1,6 +1,7 @@
 """Any number and place of rotors, and rotors that fail."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,13 +11,15 @@ from flying import fly, hold
 from refusals import cases, refuses
 from tensordict import TensorDict
 
+import torchrl_quad
 from torchrl_quad import HoveringEnv, load_drone
 from torchrl_quad.controllers import GeometricController
 from torchrl_quad.deploy import contract, frames
 from torchrl_quad.deploy.simulators import make_simulator, special
 from torchrl_quad.dynamics import FlightController, Quadrotor
 from torchrl_quad.envs import Disturbance
-from torchrl_quad.identification.prediction import columns
+from torchrl_quad.identification import prediction_error, read_log
+from torchrl_quad.identification.prediction import log_columns
 
 F64 = torch.float64
 
@@ -221,6 +224,9 @@ def test_a_worn_drone_flies_worn_while_its_controller_believes_it_whole_and_othe
     drawn = {"rotor_effectiveness": {"uniform": [0.7, 1.0]}}
     works = HoveringEnv(num_envs=500, randomize=drawn).reset()["state", "drone", "rotor_effectiveness"]
     assert works.shape == (500, 4) and 0.7 <= works.min() < 0.71 and works.std(0).min() > 0.07
+    drawn = {"rotor_effectiveness": {"scale": [0.9, 1.0]}}
+    works = HoveringEnv(num_envs=500, drone=worn, randomize=drawn).reset()["state", "drone", "rotor_effectiveness"]
+    assert works[:, 0].max() <= 0.5 and works[:, 1].min() >= 0.9
     with pytest.raises(ValueError, match="this drone has 6 rotors, and the one that the controller believes in has 4"):
         whole.params = drone("hexarotor")
 
@@ -289,6 +295,9 @@ def test_the_motors_of_an_autopilot_and_of_a_log_belong_to_rotors_by_their_place
     known = frames.px4().of(other.rotor_positions)
     assert known.to({"motors": thrust[[*order]]})["motors"].tolist() == theirs.tolist()
     assert known.back({"motors": theirs})["motors"].tolist() == thrust[[*order]].tolist()
-    assert thrust[columns(other)].tolist() == thrust[[*order]].tolist() and columns(usual) == [0, 1, 2, 3]
-    for call in (lambda: frames.px4().of(LAYOUTS["plus"]["rotor_positions"]), lambda: columns(drone("hexarotor"))):
+    assert thrust[log_columns(other)].tolist() == thrust[[*order]].tolist() and log_columns(usual) == [0, 1, 2, 3]
+    log = read_log(Path(torchrl_quad.__file__).parents[1] / "examples/data/figure8.csv.gz")
+    errors = [prediction_error(log, x)["body_rate"][0.5] for x in (usual, other)]
+    assert errors[0] == pytest.approx(errors[1], rel=1e-9)
+    for call in (lambda: frames.px4().of(LAYOUTS["plus"]["rotor_positions"]), lambda: log_columns(drone("hexarotor"))):
         refuses("of an X.* has rotors at ", call)

@@ -171,9 +171,53 @@ SQUARE = {"position": [0, 0, 2], "yaw": 0.0, **OPEN}
     ({"random": {"gates": 3, "turn": 2.0}}, {"radius": 1.0}, "3 gates need a turn of at least 2.09 rad, got 2"),
     ({"random": {"spacing": [4, 2]}}, {"radius": 1.0}, "spacing and heights are the least and then the greatest"),
     ({"env": {"track": {"gates": []}}}, {}, "track: cannot be read, "),
+    ({"gates": [{**SQUARE, "position": 5}, SQUARE]}, {}, "gates must be a list of points .* got .5, .0, 0, 2.."),
+    ({"gates": [SQUARE, SQUARE], "gate_radius": 0.3}, {}, "gate_radius is of gates that are points; .* Give radius"),
+    ({"random": {"heights": [-1, 4]}}, {"radius": 1.0}, "random: heights must be above the floor at 0 m; got .-1, 4."),
+    ({"random": {}, "box": [[-5, -9, 0], [9, 9, 5]]}, {"radius": 1.0}, "6 gates .* need 6 m to all sides .* up to 5 m"),
+    ({"random": {}, "starts": [[0, 0, 2]] * 6}, {"radius": 1.0}, "random draws gates and their starts. Leave out"),
 )  # fmt: skip
 def test_a_track_that_does_not_say_enough_is_refused_and_asks_by_name(track, settings, message):
     refuses(message, load_track, track, **settings)
+
+
+@cases(
+    ({"gates": [[0, 0, 1], [5, 0, 1]], "box": [[1, -1, 0], [4, 1, 2]]}, "gates stand from .*0.0, 0.0, 1.0.*"),
+    ({"gates": [[0, 0, 1], [5, 0, 1]], "position_jitter": [0, 0, 2]}, r"gates stand from \[0.0, 0.0, -1.0\] to "),
+    ({"file": "random", "position_jitter": [0, 0, 2]}, r"gates stand from \[-12.0, -12.0, -1.0\] to "),
+)  # fmt: skip
+def test_gates_that_nobody_can_reach_are_refused(track, message):
+    refuses(message, RacingEnv, num_envs=2, track=track)
+
+
+def test_what_is_given_with_a_track_replaces_what_the_track_says_and_its_result_is_a_track(tmp_path):
+    track = random_track(3, gates=4)
+    assert {gate["radius"] for gate in load_track(track, radius=0.5)["gates"]} == {0.5}
+    assert load_track(track, start=[0, 0, 3])["starts"] == [[0, 0, 3], *track["starts"][1:]]
+    other = load_track({"file": "visfly", "gates": [[0, 0, 1], [4, 0, 1]]})
+    assert other["starts"] == [[2, 0, 1]] * 2 and other["gate_radius"] == 0.3
+    for name in ("random", "six_gates"):
+        assert load_track(load_track(name)) == load_track(name)
+    changed = load_track(load_track("random"), width=2.0, height=1.0, floor=0.9)
+    assert changed["gates"][0]["width"] == 2.0 and changed["random"] == load_track("random")["random"]
+    assert len(load_track(load_track("random"), random={"gates": 4})["gates"]) == 4
+    as_tensors = [
+        {"position": torch.tensor(g["position"]), "rotation": np.array(g["rotation"])} for g in track["gates"]
+    ]
+    again = load_track({"gates": as_tensors}, width=1.5, height=1.5)
+    assert [gate["rotation"] for gate in again["gates"]] == [gate["rotation"] for gate in track["gates"]]
+    (tmp_path / "self.yaml").write_text(f"file: {tmp_path}/self.yaml")
+    refuses("self.yaml: 10 tracks name each other as file; does one name itself", load_track, tmp_path / "self.yaml")
+
+
+@pytest.mark.parametrize(
+    "change", [{"start_range": 0.6}, {"position_jitter": [9, 9, 0.2]}, {"box": [[-3, -4, 0], [4, 4, 5]]}]
+)
+def test_episodes_on_random_tracks_start_inside_the_box(change):
+    rules = {"gates": 4, "spacing": [1, 5], "heights": [0.3, 4], "yaw": 1.5}
+    env = RacingEnv(num_envs=1000, track={"random": rules, "radius": 0.3, **change})
+    state = env.reset()["state"]
+    assert not env.is_crash(state).any() and not env.is_crash({"position": state["track", "gates"]}).any()
 
 
 @pytest.mark.skipif(not WILD, reason="files of other projects, which are not in the repository")

@@ -248,7 +248,7 @@ WRONG_SETTINGS = {
     "late=1 ; late=2": "late is given twice",
     "scale={inertia: 1.0, rotor_positions: 0}": "turned: scale: plant.rotor_positions .* cannot control roll and pitch",
     "simulator=torchrl_quad ; loop=pid": "turned: torchrl_quad has no rate loop 'pid'. Choose from: contract",
-    "simulator=torchrl_quad ; mutants=true ; scale={inertia: 9}": "turned: torchrl_quad flies motors as they are",
+    "simulator=torchrl_quad ; mutants=true ; scale={inertia: 3}": "turned: torchrl_quad flies motors as they are",
     "hello": "unknown setting 'hello'. Choose from: bundle=...",
     "bundel=x": "unknown setting 'bundel=x'. Choose from: bundle=...",
     "simulator=gazebo": "Unknown simulator 'gazebo'. Choose from: torchrl_quad, mujoco",

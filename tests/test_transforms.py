@@ -103,7 +103,7 @@ def fly(env, actor, *, inside):
         rollout, carry = differentiable_rollout(env, actor, carry, 9)
     loss = 0.0
     for flight in (first, rollout):
-        for _, x in sorted(flight.items(True, True), key=str):
+        for _, x in sorted(flight.items(True, True), key=lambda item: str(item[0])):
             if x.requires_grad and x.is_floating_point():
                 loss = loss + (x.double() * torch.linspace(0.5, 1.5, x.numel()).double().view_as(x)).sum()
     flown = {i: dict(x.items(True, True)) for i, x in enumerate((first, rollout, carry))}
@@ -112,15 +112,18 @@ def fly(env, actor, *, inside):
     return flown, of_actions, torch.autograd.grad(loss, list(actor.parameters()))
 
 
-def check(transform, in_keys=("observation",), *, coarse=False, recurrent=False, **options):
+def check(transform, in_keys=("observation",), *, coarse=False, recurrent=False, backend=None, **options):
     base = HoveringEnv(num_envs=3, max_episode_steps=5, dtype=torch.float64, **options)
     env = TransformedEnv(base, transform)
     options = {"recurrent": True, "hidden_size": 5, "noise_correlation": 0.4} if recurrent else {}
     actor = make_actor(env, (8,), in_keys=list(in_keys), return_log_prob=True, **options)
     if recurrent:
         env = TransformedEnv(base, Compose(transform.clone(), InitTracker(), actor.make_tensordict_primer()))
-    assert flight_mode(env, actor).mode == ("inside" if base.is_compiled else "called")
-    expected, found = fly(env, actor, inside=False), fly(env, actor, inside=True)
+    expected = fly(env, actor, inside=False)
+    if backend:
+        base.compile(backend=backend)
+    assert flight_mode(env, actor).mode == ("inside" if backend else "called")
+    found = fly(env, actor, inside=True)
     torch.testing.assert_close(found, expected, **({"rtol": 2e-4, "atol": 2e-5} if coarse else {}))
 
 
@@ -133,7 +136,8 @@ def test_a_memory_flies_under_transforms():
     check(Compose(normalizer(), RewardSum()), recurrent=True)
 
 
-def test_transforms_and_memory_fly_inside_the_compiled_step():
+@pytest.mark.parametrize("backend", ["eager", pytest.param("inductor", marks=pytest.mark.slow)])
+def test_transforms_and_memory_fly_inside_the_compiled_step(backend):
     check(
         Compose(
             CatTensors(["observation", ("state", "rotor_speed")], "both", del_keys=False),
@@ -148,7 +152,7 @@ def test_transforms_and_memory_fly_inside_the_compiled_step():
         ),
         ["both", ("state", "velocity"), "target_return", "step_count"],
         recurrent=True,
-        compile=True,
+        backend=backend,
         wind={"gust": 0.5},
     )
 

@@ -1,4 +1,4 @@
-"""What follows from the numbers of a drone: whether there can be such a drone, and how its rate loop answers.
+"""What follows from the numbers of a drone: whether there can be one, where its rotors push, how its rate loop answers.
 
 Nothing here imports torch.
 """
@@ -6,6 +6,7 @@ Nothing here imports torch.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,12 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 from torchrl_quad.errors import shown
 
 Array = NDArray[np.float64]
+AXES = np.array(["thrust", "roll", "pitch", "yaw"])
 NEARLY_LINEAR = 1e-3  # of a thrust map, k2 / k1 times the highest speed, below which single precision loses the speed
+
+JUDGED = ("mass", "inertia", "rotor_positions", "thrust_map", "rotor_speed_min", "rotor_speed_max")
 
 
 def contradictions(fields: Mapping[str, ArrayLike]) -> Iterator[str]:
     """Why there is no drone with these fields, of one drone or (n, ...) of several, in words."""
-    drone = {name: np.asarray(x, float) for name, x in fields.items() if x is not None}
+    drone = {name: np.asarray(fields[name], float) for name in JUDGED}
     inertia, k2, k1 = drone["inertia"], drone["thrust_map"][..., 0], drone["thrust_map"][..., 1]
     mass, low, high = (drone[x].reshape(-1) for x in ("mass", "rotor_speed_min", "rotor_speed_max"))
     units = "Check the order of the axes and the unit: 1 g cm2 is 1e-7 kg m2"
@@ -52,6 +56,48 @@ def contradictions(fields: Mapping[str, ArrayLike]) -> Iterator[str]:
 def listed(x: ArrayLike) -> str:
     """Numbers in four digits."""
     return shown([float(f"{value:.4g}") for value in np.asarray(x, float).flat])
+
+
+def matrix(drone: Mapping[str, Any]) -> Array:
+    """The matrix (6, n) from n rotor thrusts to the force along z, the torque about x, y, z, and the force along x, y.
+
+    ``drone`` has the fields of :class:`~torchrl_quad.QuadrotorParams` as numbers and lists; the controller knows of no
+    ``rotor_effectiveness``, and this neither.
+    """
+    spin, places = np.array(drone["rotor_spin"], float), np.array(drone["rotor_positions"], float)
+    arms = np.pad(places, ((0, 0), (0, 3 - places.shape[1])))
+    up = np.array(drone.get("rotor_direction") or [(0.0, 0.0, 1.0)] * len(spin), float)
+    with np.errstate(invalid="ignore"):  # a rotor without a direction is NaN
+        up = up / np.linalg.norm(up, axis=1, keepdims=True)
+    torque = np.cross(arms, up) + float(drone["yaw_torque_coefficient"]) * spin[:, None] * up
+    return np.concatenate((up[:, 2:], torque, up[:, :2]), 1).T
+
+
+def quarters(positions: ArrayLike) -> list[int]:
+    """For each rotor of an X quadrotor its quarter: 0 front left, 1 back left, 2 back right, 3 front right; [] of none.
+
+    ``positions`` (n, 2 or 3) stand in any order.
+    """
+    x, y = np.asarray(positions, float).T[:2]
+    found = np.where(x > 0.0, np.where(y > 0.0, 0, 3), np.where(y > 0.0, 1, 2))
+    return found.tolist() if sorted(found.tolist()) == [0, 1, 2, 3] and (abs(x * y) > 0.0).all() else []
+
+
+def uncontrolled(allocation: ArrayLike) -> str:
+    """The axes about which rotors make no torque of their own, for a message; "" where they control all.
+
+    ``allocation`` is (*, k, n), of which the first four rows count, as of :func:`matrix`. With rows of one length,
+    drones have conditions below 100; rounding makes rotors on one line look controllable.
+    """
+    given = np.asarray(allocation, float)
+    rows = given[..., :4, :].reshape(-1, 4, given.shape[-1])
+    rows = rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-30)
+    left, strength, _ = np.linalg.svd(rows, full_matrices=True)
+    strength = np.pad(strength, ((0, 0), (0, 4 - strength.shape[1])))
+    weak = ~(strength > 1e-4 * strength[:, :1])
+    lacks = np.any(np.abs(left) * weak[:, None, :] > 0.1, axis=(0, 2)).tolist()
+    lacks[0] = lacks[0] and not any(lacks[1:])  # of a thrust that comes with a torque, the torque is lacking
+    return " and ".join(", ".join(AXES[lacks]).rsplit(", ", 1))
 
 
 class RateLoop:

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_quad.airframe import contradictions
-from torchrl_quad.allocation import matrix, uncontrolled
+from torchrl_quad.airframe import contradictions, matrix, uncontrolled
 from torchrl_quad.errors import MissingPackage, UserError, UserValueError, one_line, shown
 
 VERSION = 4  # of the contract; raise it when a reader of the older one would misunderstand the new one
@@ -149,7 +148,6 @@ def _contradictions(drone: Contract, name: str, hovers: bool = False) -> Iterato
     if len({len(x) for x in each}) > 1 or len({len(x) for x in each[0]}) > 1:
         yield f"{name}: rotor_positions and the other fields of rotors must be equally long"
         return
-    yield from (f"{name}.{why}" for why in contradictions({k: drone[k] for k in drone if k != "motor_command"}))
     allocation = matrix(drone)[:4]
     if not np.isfinite(allocation).all():
         yield f"{name}.rotor_direction has a rotor without a direction"
@@ -160,3 +158,4 @@ def _contradictions(drone: Contract, name: str, hovers: bool = False) -> Iterato
         least, most = (k2 * w * w + k1 * w + k0 for w in (low, high))
         if not ((max(least, 0.0) < share) & (share < most)).all():
             yield f"{name}: to hover each rotor must give {shown(share.round(4).tolist())} N, of {least:g} to {most:g}"
+    yield from (f"{name}.{why}" for why in contradictions(drone))

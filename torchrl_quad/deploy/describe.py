@@ -59,11 +59,8 @@ def numbers(x: Any) -> Any:
 def describe(env: QuadrotorEnv, rules: Rules, models: Mapping[str, ModelProto], memory: int, visual: bool) -> Fields:
     """What a contract says of an environment whose policy keeps ``memory`` numbers, before anything has flown."""
     camera = env.camera if visual else None
-    nominal, believed, delay = (
-        _fields(env.nominal),
-        _fields(env.nominal, all=True),
-        getattr(env.disturbances.get("sensors"), "delay", 0),
-    )
+    nominal, believed = (_fields(env.nominal, all=x) for x in (False, True))
+    delay = getattr(env.disturbances.get("sensors"), "delay", 0)
     weight = nominal["mass"] * nominal["gravity"]
     most = float(np.float32(nominal["max_thrust_to_weight"] * weight))
     return {

@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torchrl_quad.allocation import quarters
+from torchrl_quad.airframe import quarters
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.rotations import conjugate, multiply, rotate
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchrl_quad.allocation import uncontrolled
+from torchrl_quad.airframe import uncontrolled
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.parameters import QuadrotorParams, RawParams
 from torchrl_quad.dynamics.rigid_body import Rotors, drag, drag_moment, gyroscopic_torque, thrust_limits

@@ -183,7 +183,8 @@ class Quadrotor(ControlledModel):
 
     def check_flown(self, params: QuadrotorParams) -> None:
         """Refuse a drone with which the rate loop is unstable."""
-        if not isinstance(self.controller, RotorThrustController):
+        same = (torch.equal(getattr(params, k), getattr(self.nominal, k)) for k in ("inertia", "motor_time_constant"))
+        if not (isinstance(self.controller, RotorThrustController) or all(same)):
             check_flown(self.nominal, params, self.dt)
 
     def rest(self, position: Tensor) -> dict[str, Tensor]:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_quad.airframe import contradictions
+from torchrl_quad.airframe import JUDGED, contradictions
 from torchrl_quad.dynamics import presets
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.options import between, build, checked
@@ -85,10 +85,9 @@ class QuadrotorParams:
     gravity: Tensor = _field((1,), 1e-2, 1e3, "m/s2")  #: (1) [m/s2]
     #: (1) [m], above the centre of mass, where the drag acts
     drag_height: Tensor = _field((1,), -1e0, 1e0, "m", default=0.0)
-    #: (n, 3), along the thrust of each rotor, body frame; its length does not count. None: all upright, (0, 0, 1)
+    #: (n, 3), along the thrust of each rotor, body frame; its length does not count. All upright where None
     rotor_direction: Tensor | None = _field(("n", 3), -1e1, 1e1, default=None)
-    #: (n), a factor on thrust and torque of each rotor: 0 is a dead one. It belongs to the drone that flies, and its
-    #: controller does not know of it. None: all whole, 1
+    #: (n), a factor on thrust and torque of each rotor, 0 for a dead one, 1 where None; the controller does not use it
     rotor_effectiveness: Tensor | None = _field(("n",), 0.0, 1e1, default=None)
     motor_command: MotorCommand | None = None  #: from motor commands of logs to rotor speeds; None if unknown
 
@@ -97,7 +96,7 @@ class QuadrotorParams:
         fields = self.fields()
         for name, value in fields.items():
             object.__setattr__(self, name, _checked(name, value, like, "QuadrotorParams", fields["rotor_positions"]))
-        for broken in contradictions({name: x.detach().cpu().numpy() for name, x in self.fields().items()}):
+        for broken in contradictions({name: getattr(self, name).detach().cpu().numpy() for name in JUDGED}):
             raise UserValueError(f"QuadrotorParams: {broken}.")
 
     def __repr__(self) -> str:

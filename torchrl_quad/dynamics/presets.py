@@ -44,7 +44,7 @@ def read(kind: str, preset: str | Path | Mapping, folder: Traversable | None = N
     if not path.is_file():  # which a pipe or a device is not, whose reading may never end
         raise FileNotFoundError(f"No {kind} file at {path}. {choices} the path of a .yaml file that exists.")
     with path.open("rb") as file:
-        values = (parse_toml if path.suffix == ".toml" else parse)(file.read(MAX_BYTES + 1), source)
+        values = (parse_toml if source.endswith(".toml") else parse)(file.read(MAX_BYTES + 1), source)
     if not isinstance(values, Mapping):
         raise UserValueError(f"{source}: expected a mapping of names to values, got {type(values).__name__}.")
     return source, values

@@ -173,9 +173,10 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
     def set_params(self, params: QuadrotorParams) -> None:
         """Set :attr:`params`, also through a TransformedEnv, where an assignment would not reach this environment."""
         config.check_params(params, self.num_envs, self.nominal)
-        config.check_flown(self.dynamics, params)
         fits = all(x.dtype == self.dtype and x.device == self.device for x in params.fields().values())
-        self._params = params if fits else params.to(device=self.device, dtype=self.dtype)
+        params = params if fits else params.to(device=self.device, dtype=self.dtype)
+        config.check_flown(self.dynamics, params)
+        self._params = params
 
     def set_initial_state_source(self, source: Callable[[int], TensorDictBase] | None) -> None:
         """Choose where resets start, also through a TransformedEnv: ``source(n)`` returns n complete states, the
@@ -228,7 +229,7 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
             return self
         super().to(device)
         flying = None if self.params is self.nominal else self.params.to(device=self.device)
-        self._place(self.nominal.to(device=self.device))
+        self._place(self._built.to(device=self.device))
         self._params = self.nominal if flying is None else flying
         self.set_up()
         safe_state = {key: x.to(self.device) for key, x in self.control_step.safe_state.items()}
@@ -245,10 +246,11 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
 
         return draw_frame(self, drones, size)
 
-    def _place(self, nominal: QuadrotorParams) -> None:
+    def _place(self, drone: QuadrotorParams) -> None:
         """Build what holds tensors on the device and in the precision of the environment."""
-        self.dynamics = config.build_dynamics(nominal, self._options)
-        self.disturbances = config.build_disturbances(self.dynamics, self._options)
+        self._built = drone = drone.detach()
+        self.dynamics = config.build_dynamics(drone, self._options)
+        self.disturbances = config.build_disturbances(self.dynamics, drone, self._options)
         self.randomness = Randomness(self.device, self.dtype)
 
     def _connect(self, safe_state: State, options: dict[str, Any] | None = None) -> None:

@@ -117,13 +117,16 @@ def build_dynamics(nominal: QuadrotorParams, options: Mapping[str, Any]) -> Dyna
     return model(nominal, dt=dt, substeps=substeps, integrator=options["integrator"], **more)
 
 
-def build_disturbances(dynamics: Dynamics, options: Mapping[str, Any]) -> dict[str, Disturbance]:
-    """The disturbances by name, in the order in which they act."""
+def build_disturbances(
+    dynamics: Dynamics, drone: QuadrotorParams, options: Mapping[str, Any]
+) -> dict[str, Disturbance]:
+    """The disturbances by name, in the order in which they act; those of a drone with worn rotors start from these."""
     chosen: dict[str, Disturbance] = {}
     if options["random_start"]:
         chosen["random_start"] = build(RandomStart, "random_start", options["random_start"])
     if options["randomize"]:
-        drawn = DroneRandomization(options["randomize"], dynamics.nominal, dynamics.plant_fields)
+        worn = dynamics.nominal.replace(rotor_effectiveness=drone.rotor_effectiveness)
+        drawn = DroneRandomization(options["randomize"], worn, dynamics.plant_fields)
         chosen["randomize"] = drawn
         for params in drawn.liveliest(dynamics.nominal):
             check_flown(dynamics, params, "randomize: a ")

@@ -27,6 +27,7 @@ WEIGHTS = {  # of the reward's terms, by reward
 RELAXATION_WEIGHTS = {"log": {"gate": 5.0}, "reciprocal": {"gate": 1.0}}
 GATES, ROTATIONS = ("track", "gates"), ("track", "rotations")  # in the state, where each episode has another track
 FirstGate = Annotated[int, between(0, 999)]
+START_ROOM = 0.05  # [m], to the sides of the box, at least
 SAMPLES = 8  # of the way of a step, on which it may touch the frame of a gate
 
 
@@ -161,20 +162,30 @@ class RacingEnv(QuadrotorEnv):
         self.is_drawn = self.course is not None or any((*self.moved, *self.turned))
         self.drone_radius, self.floor = reach_of(self.nominal), track.get("floor", 0.0)
         low, high = self.gates.amin(0), self.gates.amax(0)
+        if self.course is not None:
+            reach, heights = self.course.reach, self.course.heights
+            low, high = self.tensor([-reach, -reach, min(heights)]), self.tensor([reach, reach, max(heights)])
+        moved = self.tensor(self.moved)
+        low, high = low - moved, high + moved
+        places = [(f"gates stand from {_metres(low)} to {_metres(high)}", low, high)]
         self.half_width = 0.5 * (high - low)[:2] + self.box_margin
         self.ceiling = max(self.box_height, high[2].item() + self.box_margin)
         if "box" in track:
             low, high = self.tensor(track["box"])
             self.half_width, self.floor, self.ceiling = 0.5 * (high - low)[:2], low[2].item(), high[2].item()
         self.centre = 0.5 * (low + high)
-        for start, point in zip(self.starts, track["starts"], strict=True):
-            room = self.tensor(self.moved) + self.start_range  # starts move with their gates
-            corners = torch.stack((start - room, start + room))
-            if self.is_crash({"position": corners}).any():
+        self.centre[2] = 0.5 * (self.floor + self.ceiling)
+        self.half_box = torch.cat((self.half_width, self.centre[2:] - self.floor))
+        if self.course is None:  # else starts are put inside the box
+            room = moved + self.start_range  # starts move with their gates
+            for start, point in zip(self.starts, track["starts"], strict=True):
+                places.append((f"drones start within {self.start_range} m of {point}", start - room, start + room))
+        for what, *corners in places:
+            if self.is_crash({"position": torch.stack(corners)}).any():
+                low, high = (_metres(self.centre + sign * self.half_box) for sign in (-1.0, 1.0))
                 raise UserValueError(
-                    f"track: drones start within {self.start_range} m of {point}, which is not all inside the box: x "
-                    f"and y at most {self.box_margin} m beyond the gates, {self.floor:g} < z < {self.ceiling} m. Move "
-                    "that start."
+                    f"track: {what}, which is not all inside the box from {low} to {high} m. Move them, or give a "
+                    "wider box, or less position_jitter or start_range."
                 )
 
     def initial_state(self, n: int) -> State:
@@ -187,7 +198,10 @@ class RacingEnv(QuadrotorEnv):
             starts = starts + self.pose(state, gate)[0] - self.gates[gate[:, 0]]
         if self.course is not None:
             every = starts_before(state[GATES], state.get(ROTATIONS), self.floor)
-            starts = every[torch.arange(n, device=self.device), gate[:, 0]]
+            room = (self.half_box - self.start_range - START_ROOM).clamp_min(0.0)
+            starts = self.centre + torch.clamp(
+                every[torch.arange(n, device=self.device), gate[:, 0]] - self.centre, -room, room
+            )
         start = self.hover_state(starts + self.start_range * self.uniform(n, 3))
         return {
             **start,
@@ -370,6 +384,10 @@ class RacingEnv(QuadrotorEnv):
             )
             marked["shapes"] = [Shape.line(outer.flatten(0, 1))]
         return Markers("next gate", **marked, progress="gates_passed", success=success)
+
+
+def _metres(point: Tensor) -> list[float]:
+    return point.double().round(decimals=3).tolist()
 
 
 def _box(beyond: Tensor) -> Tensor:

@@ -33,9 +33,16 @@ _TRACK = "the name of a track, the path of a YAML or TOML file, or a mapping"
 TrackOption = Annotated[Any, accepted(lambda x: isinstance(x, str | Path | Mapping), _TRACK)]
 _TRACKS = resources.files("torchrl_quad.envs") / "tracks"
 _OPENING = ("width", "height", "radius")  # of gates with a direction
-_SIZES = {"gate_radius", *_OPENING}
+_SIZES = ("gate_radius", *_OPENING)
+# What a setting says otherwise, besides the key of its own name.
+_REPLACES = {
+    **dict.fromkeys(_SIZES, _SIZES),
+    "gates": ("random", "start", "starts"),
+    "random": ("gates", "start", "starts"),
+}
+MAX_FILES = 10  # of tracks that change each other
 _KEYS = {  # what else a track may say, beside its points
-    **{key: (Length, "Of all gates [m].") for key in ("gate_radius", *_OPENING)},
+    **{key: (Length, "Of all gates [m].") for key in _SIZES},
     "frame": (Length, "How thick the bars around gates are [m]."),
     "closed": (bool, "Whether the first gate follows the last."),
     "floor": (Annotated[float, between(-1e4, 1e4)], "Its height [m]."),
@@ -89,7 +96,7 @@ class Gate:
         else:
             q = np.array(self.rotation) / math.hypot(*self.rotation)
         size = {name: float(x) for name in _OPENING if (x := getattr(self, name)) is not None}
-        return {"position": list(self.position), "rotation": q.tolist(), **size}
+        return {"position": self.position, "rotation": q.tolist(), **size}
 
 
 @checked
@@ -103,6 +110,8 @@ class Course:
         turn: the greatest change of course at a gate [rad], at least 2 pi over the number of gates.
         heights: the least and the greatest [m], or one for each gate.
         yaw: how far a gate may be turned from the mean of the ways to it and from it [rad], 0 to 1.5.
+        reach: how far from the origin gates may be, horizontally [m]; at most a quarter of the greatest length of the
+            course, and up to the sides of the ``box``, if the track has one.
     """
 
     gates: Annotated[int, between(3, 50)] = 6
@@ -110,6 +119,7 @@ class Course:
     turn: Annotated[float, between(0.1, 3.1)] = 2.2
     heights: Annotated[Sequence[Annotated[float, between(-1e3, 1e3)]], entries(2, 50)] = (1.0, 3.0)
     yaw: Annotated[float, between(0.0, 1.5)] = 0.3
+    reach: Annotated[float, between(0.0, 1e4)] = 1e4
 
     def __post_init__(self) -> None:
         if self.turn < (least := 2.0 * math.pi / self.gates):
@@ -118,11 +128,13 @@ class Course:
             raise UserValueError("spacing and heights are the least and then the greatest.")
         if len(self.heights) not in (2, self.gates):
             raise UserValueError(f"heights are the least and the greatest, or one for each of the {self.gates} gates.")
-
-    @property
-    def reach(self) -> float:
-        """How far from the origin gates may be [m]."""
-        return 0.25 * self.gates * self.spacing[1]
+        object.__setattr__(self, "reach", min(self.reach, 0.25 * self.gates * self.spacing[1]))
+        least = 0.25 * sum(self.spacing) / math.sin(math.pi / self.gates)
+        if self.reach < least * (1.0 - 1e-9):
+            raise UserValueError(
+                f"{self.gates} gates with this spacing need {least:.3g} m to all sides of the origin, and may be up to "
+                f"{self.reach:.3g} m from it. Choose fewer gates, a smaller spacing, or a wider box."
+            )
 
     def draw(self, n: int, uniform: Callable[..., Tensor]) -> tuple[Tensor, Tensor]:
         """Draw n courses: centres (n, k, 3) [m], and rotations (n, k, 4).
@@ -177,30 +189,41 @@ def load_track(track: str | Path | Mapping = "visfly", **settings: Any) -> dict[
         ValueError: a key is unknown or missing, or a value is not what :class:`RacingEnv` takes.
         FileNotFoundError: there is no such file.
     """
-    source, values = presets.read("track", track, _TRACKS)
-    if _SIZES & settings.keys():
-        values = {key: x for key, x in values.items() if key not in _SIZES}
-    values = own_format(source, {**values, **settings})
-    if "file" in values:
-        return load_track(values.pop("file"), **values)
+    source, values = _read(track, settings)
+    values = own_format(source, values)
     for key in values.keys() - set(_PARTS):
         raise UserValueError(f"{source}: unknown key {shown(key)}. Allowed: {', '.join(_PARTS)}.")
     found = {key: check_value(f"{source}: {key}", values[key], *_KEYS[key]) for key in _KEYS if key in values}
     found |= {key: values[key] for key in ("scene", "notes") if key in values}
     shape = {key: found.pop(key) for key in _OPENING if key in found}
     raw, floor = values.get("gates"), found.get("floor", 0.0)
+    if "box" in values:
+        found["box"] = _points(source, "box", values["box"], -1e4)
+        if len(found["box"]) != 2 or not all(a < b for a, b in zip(*found["box"], strict=True)):
+            raise UserValueError(f"{source}: box must be its lowest and its highest corner, [x, y, z] each.")
     if "random" in values:
         course = build(Course, f"{source}: random", values["random"] or {})
-        found["random"], reach, top = asdict(course), course.reach + MARGIN, max(course.heights) + MARGIN
-        values = {"box": [[-reach, -reach, floor], [reach, reach, top]], **values}
-        centres, rotations = (
-            x[0].tolist() for x in course.draw(1, lambda *size: torch.zeros(size, dtype=torch.float64))
-        )
-        raw = centres if "gate_radius" in found else _gates(centres, rotations)
+        if "box" in found:
+            sides = np.abs(found["box"])[:, :2] - np.array(found.get("position_jitter", (0.0, 0.0, 0.0)))[:2]
+            reach = min(course.reach, max(0.0, float(sides.min())))
+            course = build(Course, f"{source}: random", {**asdict(course), "reach": reach})
+        if min(course.heights) <= floor:
+            raise UserValueError(
+                f"{source}: random: heights must be above the floor at {floor:g} m; got {shown(course.heights)}."
+            )
+        found |= {**shape, "random": asdict(course)}
+        zeros = course.draw(1, lambda *size: torch.zeros(size, dtype=torch.float64))
+        raw = zeros[0][0].tolist() if "gate_radius" in found else _gates(*zeros)
     is_directed = isinstance(raw, Sequence) and any(isinstance(gate, Mapping) for gate in raw)
     if is_directed:
         if not all(isinstance(gate, Mapping) for gate in raw):
             raise UserValueError(f"{source}: gates must be all points, or all mappings with a position and a yaw.")
+        if "gate_radius" in found:
+            raise UserValueError(
+                f"{source}: gate_radius is of gates that are points; these have a direction. Give radius, or width and "
+                "height."
+            )
+        raw = [{k: x.tolist() if isinstance(x, Tensor | np.ndarray) else x for k, x in gate.items()} for gate in raw]
         own = [gate if set(gate) & set(_OPENING) else {**gate, **shape} for gate in raw]
         found["gates"] = [build(Gate, f"{source}: gate {i}", gate).entries() for i, gate in enumerate(own, 1)]
         if len({"radius" in gate for gate in found["gates"]}) > 1:
@@ -213,19 +236,22 @@ def load_track(track: str | Path | Mapping = "visfly", **settings: Any) -> dict[
     gates = _points(source, "gates", raw, floor)
     if not 2 <= len(gates) <= MAX_GATES:
         raise UserValueError(f"{source}: a track has 2 to {MAX_GATES} gates, got {len(gates)}.")
-    if not is_directed:
+    if is_directed:
+        found["gates"] = [{**gate, "position": point} for gate, point in zip(found["gates"], gates, strict=True)]
+    else:
         found |= {"gates": gates, "gate_radius": float(found.get("gate_radius", 0.3))}
     turned = torch.tensor([gate["rotation"] for gate in found["gates"]], dtype=torch.float64) if is_directed else None
     usual = starts_before(torch.tensor(gates, dtype=torch.float64), turned, floor).tolist()
-    if "start" in values:
-        usual[0] = values["start"]
     found["starts"] = _points(source, "starts", values.get("starts", usual), floor)
     if (given := len(found["starts"])) != len(gates):
         raise UserValueError(f"{source}: there must be one start before each gate, got {given} for {len(gates)}.")
-    if "box" in values:
-        found["box"] = _points(source, "box", values["box"], -1e4)
-        if len(found["box"]) != 2 or not all(a < b for a, b in zip(*found["box"], strict=True)):
-            raise UserValueError(f"{source}: box must be its lowest and its highest corner, [x, y, z] each.")
+    if "start" in values:
+        found["starts"][:1] = _points(source, "start", [values["start"]], floor)
+    if "random" in values:
+        stand = [gate.get("position") if isinstance(gate, Mapping) else gate for gate in _rows(values.get("gates"))]
+        is_own = str(stand) == str(gates)  # what this function returned
+        if "start" in values or (not is_own and {"gates", "starts"} & set(values)):
+            raise UserValueError(f"{source}: random draws gates and their starts. Leave out gates, start and starts.")
     return found
 
 
@@ -250,10 +276,26 @@ def random_track(seed: int, **settings: Any) -> dict[str, Any]:
     def uniform(*shape: int) -> Tensor:
         return 2.0 * torch.rand(shape, generator=generator, dtype=torch.float64) - 1.0
 
-    centres, rotations = (x[0].tolist() for x in Course(**track.pop("random")).draw(1, uniform))
-    shape = {key: x for key, x in track["gates"][0].items() if key in _OPENING} if "gate_radius" not in track else {}
-    gates = _gates(centres, rotations) if shape else centres
-    return load_track({key: x for key, x in track.items() if key != "starts"} | {"gates": gates, **shape})
+    drawn = Course(**track.pop("random")).draw(1, uniform)
+    gates = drawn[0][0].tolist() if "gate_radius" in track else _gates(*drawn)
+    return load_track({key: x for key, x in track.items() if key != "starts"} | {"gates": gates})
+
+
+def _read(track: Any, settings: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    """What a track says, with the settings that change it, and its name in errors."""
+    values, source = dict(settings), "track"
+    for _ in range(MAX_FILES):
+        source, said = presets.read("track", track, _TRACKS)
+        replaced = {name for key in values for name in _REPLACES.get(key, ())}
+        said = {key: x for key, x in said.items() if key not in replaced}
+        if replaced.issuperset(_SIZES) and (gates := _rows(said.get("gates"))):
+            own = (({k: x for k, x in g.items() if k not in _SIZES} if isinstance(g, Mapping) else g) for g in gates)
+            said["gates"] = list(own)
+        values = {**said, **values}
+        if "file" not in values:
+            return source, values
+        track = values.pop("file")
+    raise UserValueError(f"{source}: {MAX_FILES} tracks name each other as file; does one name itself?")
 
 
 def starts_before(gates: Tensor, rotations: Tensor | None, floor: float) -> Tensor:
@@ -271,8 +313,14 @@ def forward(rotations: Tensor) -> Tensor:
     return quaternion.rotate(rotations, 0.0 * rotations[..., 1:] + rotations.new_tensor([1.0, 0.0, 0.0]))
 
 
-def _gates(centres: list, rotations: list) -> list[dict[str, Any]]:
-    return [{"position": p, "rotation": q} for p, q in zip(centres, rotations, strict=True)]
+def _rows(gates: Any) -> Sequence[Any]:
+    return gates if isinstance(gates, Sequence) and not isinstance(gates, str) else ()
+
+
+def _gates(centres: Tensor, rotations: Tensor) -> list[dict[str, Any]]:
+    """The first of the courses drawn."""
+    poses = zip(centres[0].tolist(), rotations[0].tolist(), strict=True)
+    return [{"position": position, "rotation": rotation} for position, rotation in poses]
 
 
 def _points(source: str, name: str, value: Any, floor: float) -> Any:

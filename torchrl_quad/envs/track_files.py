@@ -125,7 +125,7 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
         "the drone hovers above its start; drone, sensors and disturbances are not read",
     ]
     own |= {"start_range": 0.05, "floor": box[0][2], "notes": notes}
-    if track.get("randomize", False):  # of positions it says nothing but the limits
+    if track.get("randomize", False) or "random" in values:  # of positions it says nothing but the limits
         low, high = box
         reach = min(high[i] - low[i] for i in (0, 1)) / 2.0
         heights = centres[:, 2].tolist()
@@ -135,6 +135,7 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
             "heights": heights,
             "turn": 2.2,
             "yaw": 0.75,
+            **(values.get("random") or {}),
         }
         notes.append("gates stand anew in each episode, by the rules of random tracks; no poles")
         return own

@@ -9,13 +9,13 @@ import struct
 import zlib
 from array import array
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from torchrl_quad.airframe import quarters
 from torchrl_quad.deploy.frames import motor_signal
 from torchrl_quad.errors import shown
 from torchrl_quad.identification.errors import NoFlight, UnreadableLog, WrongMotors
@@ -30,14 +30,13 @@ _TICKS = {1: ("<u4", 1e-3), 2: ("<u8", 1e-6)}
 _VARIABLE = re.compile(r"(.+)\(([bBhHiIqQfd?])\)")
 
 
-@dataclass
-class _Subscription:
+class _Subscription(NamedTuple):
     """A message that is logged, and where in the file its samples are."""
 
     name: str
     instance: int
     record: np.dtype
-    starts: array = field(default_factory=lambda: array("Q"))
+    starts: array
 
 
 def read_ulog(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
@@ -54,7 +53,7 @@ def read_ulog(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
     """
     log = _Log(data)
     log.scan()
-    used = sorted((s for s in log.subscriptions if s.starts), key=lambda s: (s.name, s.instance))
+    used = sorted((s for s in log.subscriptions if s.starts), key=lambda s: s[:2])
     if not used:
         raise UnreadableLog(f"{name} is not a readable ULog: it holds no sample of any message. Copy it again.")
     notes = []
@@ -83,12 +82,11 @@ def read_ulog(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
 # By MAV_TYPE of MAVLink, the vehicles that do not fly by four rotors alone.
 _VEHICLES = dict.fromkeys(range(19, 26), "a VTOL") | {1: "an aeroplane", 4: "a helicopter", 13: "a hexacopter"}
 _VEHICLES |= {14: "an octocopter", 15: "a tricopter", 29: "a dodecacopter", 35: "a decacopter"}
-_CORNERS = ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0))  # of the quad X, FRD
+_CORNERS = (0, 2, 3, 1)  # of motors 1 to 4 of the quad X, by their quarters where y points right
 _OUTPUTS = re.compile(r"actuator_outputs(#\d+)?")
 
 
 def _check_vehicle(streams: Mapping[str, Stream], parameters: Mapping[str, float], name: str) -> None:
-    """Refuse what was never armed, and what has other than four rotors."""
     column = {column: x for stream in streams.values() for column, x in stream.columns.items()}
     pulses = {c: x for c, x in column.items() if _OUTPUTS.match(c) and re.search(r"output\[\d+\]$", c) and x.any()}
     rest = parameters.get("PWM_DISARMED", 900)
@@ -115,34 +113,29 @@ def _check_vehicle(streams: Mapping[str, Stream], parameters: Mapping[str, float
 
 def _add_signals(streams: dict[str, Stream], parameters: Mapping[str, float]) -> str:
     """The signals of the motors as columns of a stream; and a note on them."""
-    place = [[parameters.get(f"CA_ROTOR{k}_P{x}", np.nan) for x in "XY"] for k in range(4)]
-    found = [[k for k in range(4) if (np.sign(place[k]) == corner).all()] for corner in _CORNERS]
-    placed = all(len(x) == 1 for x in found)
-    order = [x[0] for x in found] if placed else [0, 1, 2, 3]
+    placed = quarters([[parameters.get(f"CA_ROTOR{k}_P{x}", 0.0) for x in "XY"] for k in range(4)])
+    order = [placed.index(quarter) for quarter in _CORNERS] if placed else range(4)
+    outputs = [stem for stem in streams if _OUTPUTS.fullmatch(stem)]
     stem, signals, said = "", {}, "nowhere: neither actuator_motors nor actuator_outputs were logged"
-    motors = streams.get("actuator_motors")
-    if motors is not None:
-        curve = min(max(parameters.get("THR_MDL_FAC", 0.0), 0.0), 1.0)
-        for k, place in enumerate(order):
-            control = motors.columns.get(f"actuator_motors.control[{place}]")
-            if control is not None:
-                with np.errstate(invalid="ignore", over="ignore"):  # NaN of some patterns warn
-                    thrust = np.nan_to_num(control.astype(float))
-                    signals[f"actuator_motors.signal[{k}]"] = motor_signal(thrust, curve)
-        stem, said = "actuator_motors", f"actuator_motors, after the thrust curve of THR_MDL_FAC = {curve:g}"
-    elif any(_OUTPUTS.fullmatch(x) for x in streams):
-        moves = {
-            stem: sum(float(np.std(np.nan_to_num(stream.columns.get(f"{stem}.output[{k}]", 0.0)))) for k in range(16))
-            for stem, stream in streams.items()
-            if _OUTPUTS.fullmatch(stem)
-        }
-        stem = max(moves, key=lambda stem: moves[stem])
-        ports = {101 + k: (p, n - 1) for p in ("AUX", "MAIN") for n in range(16, 0, -1) for k in range(4)
-                 if parameters.get(f"PWM_{p}_FUNC{n}") == 101 + k}  # fmt: skip
+    if "actuator_motors" in streams:
+        stem, curve = "actuator_motors", min(max(parameters.get("THR_MDL_FAC", 0.0), 0.0), 1.0)
+        said = f"actuator_motors, after the thrust curve of THR_MDL_FAC = {curve:g}"
         for k, motor in enumerate(order):
-            port, place = ports.get(101 + motor, ("MAIN", motor))
-            pulses = streams[stem].columns.get(f"{stem}.output[{place}]")
-            own = [parameters.get(f"PWM_{port}_{x}{place + 1}", -1.0) for x in ("MIN", "MAX")]
+            control = streams[stem].columns.get(f"{stem}.control[{motor}]")
+            if control is not None:
+                with np.errstate(over="ignore"):
+                    signals[f"{stem}.signal[{k}]"] = motor_signal(np.nan_to_num(numbers(control)), curve)
+    elif outputs:
+        moves = {
+            x: sum(np.std(np.nan_to_num(streams[x].columns.get(f"{x}.output[{k}]", 0.0))) for k in range(16))
+            for x in outputs
+        }
+        stem = max(outputs, key=lambda x: moves[x])
+        ports = {parameters.get(f"PWM_{p}_FUNC{n}"): (p, n) for p in ("AUX", "MAIN") for n in range(16, 0, -1)}
+        for k, motor in enumerate(order):
+            port, n = ports.get(101 + motor, ("MAIN", motor + 1))
+            pulses = streams[stem].columns.get(f"{stem}.output[{n - 1}]")
+            own = [parameters.get(f"PWM_{port}_{x}{n}", -1.0) for x in ("MIN", "MAX")]
             usual = parameters.get("PWM_MIN", 1000.0), parameters.get("PWM_MAX", 2000.0)
             low, high = (x if x > 0.0 else y for x, y in zip(own, usual, strict=True))
             if pulses is not None and high > low:
@@ -213,7 +206,7 @@ class _Log:
                 if len(columns) > self.room:
                     del self.formats[message]  # so that it is not unfolded again and again
                     raise ValueError
-                self.current[number] = _Subscription(message, instance, np.dtype(columns))
+                self.current[number] = _Subscription(message, instance, np.dtype(columns), array("Q"))
                 self.subscriptions.append(self.current[number])
                 self.room -= len(columns)
         elif kind == ord("F") and not self.flying:
@@ -255,8 +248,7 @@ def read_usd(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
         version, kinds = struct.unpack_from("<HH", body, 1)
         if version not in _TICKS:
             raise ValueError(f"version {version}, and 1 and 2 are known")
-        tick, unit = _TICKS[version]
-        records, names, at = {}, {}, 5
+        (tick, unit), records, names, at = _TICKS[version], {}, {}, 5
         for _ in range(kinds):
             (kind,) = struct.unpack_from("<H", body, at)
             names[kind], at = _text(body, at + 2)
@@ -274,31 +266,24 @@ def read_usd(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
         raise UnreadableLog(
             f"{name} begins like a uSD log, but its header cannot be read: {error}. Copy it again, or export it as CSV."
         ) from error
-    starts, left = _events(body, at, {kind: record.itemsize for kind, record in records.items()})
-    if left:
-        notes.append(f"the last {left} bytes of the uSD log were not read: they are not whole events")
+    starts, sizes = {kind: array("Q") for kind in records}, {kind: record.itemsize for kind, record in records.items()}
+    while at + 2 <= len(body):
+        kind = body[at] | body[at + 1] << 8
+        if kind not in records or at + sizes[kind] > len(body):
+            break
+        starts[kind].append(at)
+        at += sizes[kind]
+    if at < len(body):
+        notes.append(f"the last {len(body) - at} bytes of the uSD log were not read: they are not whole events")
     streams = []
     for kind, record in records.items():
         rows = pick(body, starts[kind], record)
-        with np.errstate(invalid="ignore"):  # NaN of some patterns warn
-            values = {field: rows[field].astype(float) for field in record.names[2:]}
+        values = {field: numbers(rows[field]) for field in record.names[2:]}
         if "stateEstimateZ.quat" in values and rows["stateEstimateZ.quat"].dtype.kind in "iu":
             q = decompress_quaternions(rows["stateEstimateZ.quat"])
             values |= {f"stateEstimateZ.q{axis}": q[:, k] for k, axis in enumerate("xyzw")}
         streams.append(Stream(names[kind], rows["tick"] * unit, values))
     return streams, notes
-
-
-def _events(body: bytes, at: int, sizes: dict[int, int]) -> tuple[dict[int, array], int]:
-    """Where the events of each kind begin, and how many bytes at the end belong to none."""
-    starts = {kind: array("Q") for kind in sizes}
-    while at + 2 <= len(body):
-        kind = body[at] | body[at + 1] << 8
-        if kind not in sizes or at + sizes[kind] > len(body):
-            break
-        starts[kind].append(at)
-        at += sizes[kind]
-    return starts, len(body) - at
 
 
 def decompress_quaternions(compressed: NDArray[np.integer]) -> Array:
@@ -319,6 +304,12 @@ def decompress_quaternions(compressed: NDArray[np.integer]) -> Array:
 def _text(body: bytes, at: int) -> tuple[str, int]:
     end = body.index(b"\0", at)
     return body[at:end].decode(), end + 1
+
+
+def numbers(raw: NDArray[Any]) -> Array:
+    """A column in float64."""
+    with np.errstate(invalid="ignore"):  # NaN of some patterns warn
+        return raw.astype(float)
 
 
 def pick(data: bytes, starts: array, record: np.dtype) -> NDArray[np.void]:

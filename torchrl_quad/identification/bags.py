@@ -13,18 +13,7 @@ import numpy as np
 
 from torchrl_quad.errors import UserError, one_line
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog, WrongMotors
-from torchrl_quad.identification.layouts import (
-    BY_IMU,
-    RIVALS,
-    ROS,
-    Asked,
-    Columns,
-    Layout,
-    choose,
-    listed,
-    named_alike,
-    shipped,
-)  # fmt: skip
+from torchrl_quad.identification.layouts import BY_IMU, RIVALS, ROS, Asked, Layout, choose, listed, named_alike, shipped
 from torchrl_quad.identification.signals import Array, Stream, open_plain
 
 LIKELY = ("pose", "odometry", "imu", "motors", "actuators", "battery")
@@ -63,6 +52,7 @@ def _read(bag: Any, name: str, columns: Asked) -> tuple[list[Stream], Layout, li
     asked: dict[str, list[str]] = {}
     for column in sorted(layout.names):
         asked.setdefault(column.split(".")[0], []).append(column)
+    places = {column: re.findall(r"[^.\[\]]+", column.partition(".")[2]) for column in layout.names}
     missing = sorted(asked.keys() - topics.keys())
     if missing:
         raise MissingColumns(f"{name} has no topic {', '.join(missing)}. {_there(topics, missing)}")
@@ -73,13 +63,11 @@ def _read(bag: Any, name: str, columns: Asked) -> tuple[list[Stream], Layout, li
         topic = connection.topic
         message = bag.deserialize(raw, connection.msgtype)
         try:
-            rows[topic].extend([_number(message, column.partition(".")[2]) for column in asked[topic]])
+            rows[topic].extend([_number(message, places[column]) for column in asked[topic]])
         except (AttributeError, IndexError, TypeError, ValueError) as error:
             fields = ", ".join(field.name for field in dataclasses.fields(message))
-            raise MissingColumns(
-                f"{topic} lacks a field of {', '.join(asked[topic])}, or it is not a number: {error}. Its messages "
-                f"have: {fields}."
-            ) from error
+            said = f"{topic} lacks a field of {', '.join(asked[topic])}, or it is not a number: {error}."
+            raise MissingColumns(f"{said} Its messages have: {fields}.") from error
         received[topic].append((at - begin) * 1e-9)
         stamp = getattr(getattr(message, "header", None), "stamp", None)
         stamped[topic].append((stamp.sec * 10**9 + stamp.nanosec - begin) * 1e-9 if stamp else -begin * 1e-9)
@@ -101,9 +89,9 @@ def _is_clock(stamps: Array, zero: float) -> bool:
     return len(stamps) > 1 and bool((stamps[1:] > zero).all()) and stamps.max() > stamps.min()
 
 
-def _number(message: Any, place: str) -> float:
-    """What lies at a place of a message, such as ``pose.position.x`` or ``normalized[0]``."""
-    for part in re.findall(r"[^.\[\]]+", place):
+def _number(message: Any, place: Sequence[str]) -> float:
+    """What lies at a place of a message, such as pose, position, x, or normalized, 0."""
+    for part in place:
         message = message[int(part)] if part.isdecimal() else getattr(message, part)
     return float(message)
 
@@ -116,12 +104,12 @@ def _layout(bag: Any, topics: Mapping[str, str], columns: Asked, name: str) -> L
     if named & {"position", "quaternion"}:  # the caller means the pose of that topic only
         named |= {"position", "quaternion", "velocity_body"}
     named |= {second for first, second in RIVALS if first in named}
-    found: dict[str, tuple[Columns, ...]] = {}
-    onboard = BY_IMU
+    rivals = {second: first for first, second in RIVALS}
+    found, onboard = {}, BY_IMU
     for kind, quantities in shipped("ros_messages.yaml").items():
         topics_of_kind = sorted(topic for topic in topics if topics[topic] == kind)
         for quantity, fields in quantities.items():
-            own, rival = topics_of_kind, {second: first for first, second in RIVALS}.get(quantity)
+            own, rival = topics_of_kind, rivals.get(quantity)
             if kind.endswith("/Actuators"):  # whose messages hold commands, or speeds
                 own = [topic for topic in own if _length(bag, topic, fields["of"], name)]
             if not own or {quantity, rival} & named or quantity in found or (rival in found and rival != "velocity"):

@@ -9,17 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torchrl_quad.deploy.frames import px4
-from torchrl_quad.identification.errors import (
-    Remedy,
-    WrongFrame,
-    WrongMotors,
-    WrongQuaternion,
-    WrongUnit,
-)
+from torchrl_quad.identification.errors import Remedy, WrongFrame, WrongMotors, WrongQuaternion, WrongUnit, in_units
 from torchrl_quad.identification.layouts import G
 from torchrl_quad.identification.pieces import OFF
 from torchrl_quad.identification.signals import Array, Mask, Signal, body_rates, convolved, slope, smooth
-from torchrl_quad.rotations import conjugate, rotate, rotate_inverse
+from torchrl_quad.rotations import rotate, rotate_inverse
 
 MAX_LAG = 0.3  # [s] between streams
 CALM = 0.1  # [rad/s]: slower rotations are lost in the noise of motion capture
@@ -27,13 +21,15 @@ SURE = 0.05  # how much better a hypothesis must correlate than the log as it is
 FRD = np.array([1.0, -1.0, -1.0])
 _CONJUGATE = (1.0, -1.0, -1.0, -1.0)
 _LAST, _FIRST = (3, 0, 1, 2), (1, 2, 3, 0)  # where w x y z stand in a quaternion that is read a place off
-_QUATERNIONS: dict[str, Remedy] = {  # what may be wrong, and what mends it
+_QUATERNIONS: dict[str, Remedy] = {  # what a quaternion may be, and what mends it
+    "as given": {},
     "from world to body": {"factor": _CONJUGATE},
     "scalar last": {"order": _LAST},
     "scalar last, from world to body": {"order": _LAST, "factor": _CONJUGATE},
     "scalar first": {"order": _FIRST},
     "scalar first, from world to body": {"order": _FIRST, "factor": _CONJUGATE},
 }
+_NED: Remedy = {"convention": px4(), "when": "all of the log is in NED and FRD"}
 LEAST_HOVER = 0.05  # of the full command: a drone of which this is more than hovering lifts itself a hundred times
 _COMMANDS = (  # factor, offset, least, largest, and what they are
     (0.01, 0.0, 0.0, 101.0, "percents"),
@@ -92,10 +88,8 @@ def check_angles(signal: Signal) -> None:
     """Refuse Euler angles in degrees."""
     values = signal.values
     if np.abs(values).max() > 2.0 * np.pi + 0.1:
-        raise WrongUnit(
-            f"{signal} reach {np.abs(values).max():.3g}, and are angles in rad.",
-            {"quantity": "euler", "factor": np.pi / 180.0, "when": "they are in degrees"},
-        )
+        said = f"{signal} reach {np.abs(values).max():.3g}, and are angles in rad."
+        raise WrongUnit(said, *in_units("euler", "they are in", degrees=np.pi / 180.0))
 
 
 def check_quaternion(signal: Signal) -> list[str]:
@@ -117,11 +111,8 @@ def check_velocity(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: f
     speed = np.linalg.norm(derived[moving], axis=-1)
     place = signals["position"]
     if np.percentile(speed, 99) > 100.0:
-        raise WrongUnit(
-            f"By {place} the drone flies at {np.percentile(speed, 99):.3g} m/s.",
-            {"quantity": "position", "factor": 1e-3, "when": "the position is in millimetres"},
-            {"quantity": "position", "factor": 1e-2, "when": "the position is in centimetres"},
-        )
+        said = f"By {place} the drone flies at {np.percentile(speed, 99):.3g} m/s."
+        raise WrongUnit(said, *in_units("position", "the position is in", millimetres=1e-3, centimetres=1e-2))
     signal = signals.get("velocity")
     if signal is None or speed.std() + speed.mean() < 0.05:
         return
@@ -130,13 +121,10 @@ def check_velocity(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: f
     if not 0.5 < factor < 2.0:
         size = "position" if factor < 1.0 else "velocity"
         ratio = min(factor, 1.0 / factor)
+        lengths = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
         raise WrongUnit(
             f"{signal} is {factor:.3g} times the derivative of {place}: they, or the clock, are in different units.",
-            *(
-                {"quantity": size, "factor": x, "when": f"the {size} is in {unit}"}
-                for unit, x in (("millimetres", 1e-3), ("centimetres", 1e-2), ("feet", 0.3048))
-                if 0.8 < ratio / x < 1.25
-            ),
+            *in_units(size, f"the {size} is in", **{k: x for k, x in lengths.items() if 0.8 < ratio / x < 1.25}),
             {"quantity": "velocity", "drop": True},
         )
     body, _, _ = _compare(smooth(rotate(at["quaternion"], at["velocity"]), dt), derived, dt, moving)
@@ -173,35 +161,27 @@ def check_specific_force(at: Mapping[str, Array], signals: Mapping[str, Signal],
     if fit > 0.5 and 0.5 < size / usual < 2.0:
         return
     said = f"In flight {signal} has a mean length of {size:.3g}, and the motion asks for {usual:.3g} m/s^2"
-    remedies: list[Remedy] = [{"quantity": "acceleration", "drop": True}]
+    drop: Remedy = {"quantity": "acceleration", "drop": True}
     if fit > 0.5:
-        units = (("g", G), ("thousandths of g", 1e-3 * G), ("m/s^2", 1.0 / G))  # which a preset may take for g
-        found = [(unit, x) for unit, x in units if 0.5 < x * size / usual < 2.0]
-        remedies[:0] = [
-            {"quantity": "acceleration", "factor": x, "when": f"the accelerometer is in {unit}"} for unit, x in found
-        ]
-        raise WrongUnit(f"{said} along it. It is in another unit.", *remedies)
+        units = {"g": G, "thousandths of g": 1e-3 * G, "m/s^2": 1.0 / G}  # which a preset may take for g
+        found = {unit: x for unit, x in units.items() if 0.5 < x * size / usual < 2.0}
+        remedies = in_units("acceleration", "the accelerometer is in", **found)
+        raise WrongUnit(f"{said} along it. It is in another unit.", *remedies, drop)
     if size < 0.7 * usual and size > 0.0 and (force * free).sum() > 0.5 * np.linalg.norm(force) * np.linalg.norm(free):
-        raise WrongUnit(f"{said}: it lacks gravity, which accelerometers measure.", *remedies)
-    if fit < -0.5:
-        flips = sorted(([1, -1, -1], [1, 1, -1], [-1, -1, -1]), key=lambda flip: -(force * flip * due).sum())
-        remedies[:0] = [{"quantity": "acceleration", "factor": flip, "when": "it counts so"} for flip in flips]
-        remedies.insert(0, {"convention": px4(), "when": "all of the log is in NED and FRD"})
-        said = f"{said} along the other direction"
-    raise WrongFrame(f"{said} (correlation {fit:.2f}).", *remedies)
+        raise WrongUnit(f"{said}: it lacks gravity, which accelerometers measure.", drop)
+    if fit >= -0.5:
+        raise WrongFrame(f"{said} (correlation {fit:.2f}).", drop)
+    flips = sorted(([1, -1, -1], [1, 1, -1], [-1, -1, -1]), key=lambda flip: -(force * flip * due).sum())
+    remedies = [{"quantity": "acceleration", "factor": flip, "when": "it counts so"} for flip in flips]
+    raise WrongFrame(f"{said} along the other direction (correlation {fit:.2f}).", _NED, *remedies, drop)
 
 
 def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float, moving: Mask) -> str:
     """Compare the gyro with the derivative of the attitude under every convention, and note how late it is."""
     q, given = at["quaternion"], signals["quaternion"]
-    last, first = np.roll(q, 1, -1), np.roll(q, -1, -1)
     hypotheses = {
-        "as given": q,
-        "from world to body": conjugate(q),
-        "scalar last": last,
-        "scalar last, from world to body": conjugate(last),
-        "scalar first": first,
-        "scalar first, from world to body": conjugate(first),
+        name: q[:, remedy.get("order", (0, 1, 2, 3))] * remedy.get("factor", 1.0)
+        for name, remedy in _QUATERNIONS.items()
     }
     if "angular_velocity" not in signals:
         _check_by_thrust(at, given, hypotheses, dt, moving)
@@ -227,38 +207,23 @@ def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: floa
             )
         if best == "in the world frame":
             raise WrongFrame(f"{told} if the gyro is in the world frame.", {"quantity": signal.field, "drop": True})
-        raise WrongFrame(
-            f"{told} if the gyro is of a body with y right and z down.",
-            {"convention": px4(), "when": "all of the log is in NED and FRD"},
-            {"quantity": signal.field, "factor": tuple(FRD)},
-        )
+        flip = {"quantity": signal.field, "factor": tuple(FRD)}
+        raise WrongFrame(f"{told} if the gyro is of a body with y right and z down.", _NED, flip)
+    said = f"{signal} is {factor:.3g} times the derivative of {given}: it is in"
     for unit, scale in (("degrees", np.pi / 180.0), ("milliradians", 1e-3)):
         if 1.0 / 3.0 < factor * scale < 3.0 and fit > 0.2:
-            raise WrongUnit(
-                f"{signal} is {factor:.3g} times the derivative of {given}: it is in {unit}/s.",
-                {"quantity": signal.field, "factor": scale},
-            )
+            raise WrongUnit(f"{said} {unit}/s.", {"quantity": signal.field, "factor": scale})
     if turning < CALM:
         return calm
+    derive = {"quantity": signal.field, "drop": True, "when": "the rates shall follow from the attitude"}
     if fit < 0.5:
         raise WrongFrame(
             f"{signal} does not follow {given}: their correlation is {fit:.2f} at best, also if the quaternion is "
             "scalar last or inverse, or the gyro in another frame. Name columns that belong together.",
-            {
-                "quantity": signal.field,
-                "drop": True,
-                "when": "the rates shall follow from the attitude",
-            },
+            derive,
         )
     if not 1.0 / 3.0 < factor < 3.0:
-        raise WrongUnit(
-            f"{signal} is {factor:.3g} times the derivative of {given}: it is in an unknown unit.",
-            {
-                "quantity": signal.field,
-                "drop": True,
-                "when": "the rates shall follow from the attitude",
-            },
-        )
+        raise WrongUnit(f"{said} an unknown unit.", derive)
     return f"{signal} fits the attitude: correlation {fit:.2f}, {1000.0 * lag:+.0f} ms late"
 
 
@@ -286,8 +251,8 @@ def check_order(
     """Refuse motors in another order than the one in which they turn the drone, as far as the flight tells it."""
     signal, rows = signals["motor_command"], np.concatenate([np.arange(start, stop) for start, stop in pieces])
     parts = (rows, rows[: len(rows) // 2], rows[len(rows) // 2 :])  # what is chance in one half is not in the other
-    fits = [turning_fits(at["angular_velocity"], at["motor_command"], dt, part) for part in parts]
-    worth = np.array([x[:, 0] + x[:, 1] + np.abs(x[:, 2]) for x in fits])  # yaw: which turn alike, not which way
+    fits = turning_fits(at["angular_velocity"], at["motor_command"], dt, parts)
+    worth = fits[..., 0] + fits[..., 1] + np.abs(fits[..., 2])  # yaw: which turn alike, not which way
     best = int(worth[0].argmax())
     if worth[:, best].min() < 0.4:
         return f"the order of {signal} was not checked: the flight hardly tells it ({worth[0, best]:.2f} of 3)"
@@ -302,24 +267,23 @@ def check_order(
     return f"the order of {signal} fits how the drone turns: {worth[0, 0]:.2f} of 3, and {others:.2f} in another order"
 
 
-def turning_fits(rates: Array, command: Array, dt: float, rows: NDArray[np.int_], signs: ArrayLike = _X) -> Array:
-    """How well the motors explain the angular acceleration about each axis in each order (24, 3), as correlations;
-    ``signs`` (3, 4) are those of roll, pitch and yaw by each motor."""
-    turning = slope(rates, dt)[rows]
-    turning = turning - turning.mean(0)
+def turning_fits(
+    rates: Array, command: Array, dt: float, parts: Sequence[NDArray[np.int_]], signs: ArrayLike = _X
+) -> Array:
+    """How well the motors explain the angular acceleration about each axis in each order, as correlations
+    (parts, 24, 3); ``signs`` (3, 4) are those of roll, pitch and yaw by each motor."""
     mixing = np.zeros((len(_ORDERS), 4, 3))  # the signs of a command in each order, about each axis
     for mix, order in zip(mixing, _ORDERS, strict=True):
         mix[list(order)] = np.transpose(signs)
-    best = np.zeros((len(_ORDERS), 3))
-    for lag in (0.03, 0.06):  # of the rotors [s]
-        weights = np.exp(-dt / lag * np.arange(max(2, round(6.0 * lag / dt))))
-        late = convolved(np.pad(command**2, ((len(weights) - 1, 0), (0, 0)), "edge"), weights / weights.sum())
-        late = smooth(late, dt, 0.08)[rows]
-        late = late - late.mean(0)
-        size = np.einsum("pka,kl,pla->pa", mixing, late.T @ late, mixing) * (turning**2).sum(0)
-        fits = np.einsum("pka,ka->pa", mixing, late.T @ turning) / np.sqrt(np.maximum(size, 1e-24))
-        best = max(best, fits, key=lambda x: x.sum(1).max())
-    return best
+    weights = np.exp(-dt / 0.04 * np.arange(max(2, round(0.2 / dt))))  # rotors follow with a lag, of 0.04 s or so
+    thrusts = convolved(np.pad(command**2, ((len(weights) - 1, 0), (0, 0)), "edge"), weights / weights.sum())
+    thrusts, turning = smooth(thrusts, dt, 0.08), slope(rates, dt)
+    fits = []
+    for rows in parts:
+        late, turned = (x[rows] - x[rows].mean(0) for x in (thrusts, turning))
+        size = np.einsum("pka,kl,pla->pa", mixing, late.T @ late, mixing) * (turned**2).sum(0)
+        fits.append(np.einsum("pka,ka->pa", mixing, late.T @ turned) / np.sqrt(np.maximum(size, 1e-24)))
+    return np.array(fits)
 
 
 def _compare(late: Array, early: Array, dt: float, moving: Mask) -> tuple[float, float, float]:

@@ -9,15 +9,16 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from torchrl_quad.identification.autopilots import pick
+from torchrl_quad.identification.autopilots import numbers, pick
 from torchrl_quad.identification.errors import UnreadableLog, WrongMotors
-from torchrl_quad.identification.signals import Array, Stream
+from torchrl_quad.identification.signals import Stream
 
 HEAD, _FMT = b"\xa3\x95", 128
 _TYPES = {"b": "i1", "B": "u1", "M": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4", "q": "<i8", "Q": "<u8"}
 _TYPES |= {"f": "<f4", "d": "<f8", "g": "<f2", "n": "S4", "N": "S16", "Z": "S64", "a": "V64"}
 _TYPES |= {"c": "<i2", "C": "<u2", "e": "<i4", "E": "<u4", "L": "<i4"}
 _SCALES: dict[str, float] = {**dict.fromkeys("cCeE", 0.01), "L": 1e-7}
+_MOTORS = (*range(33, 41), *range(82, 86))  # values of SERVOn_FUNCTION, of motors in their order
 _FRAMES = {2: "six", 3: "eight", 4: "eight", 5: "six", 6: "one", 7: "three", 12: "twelve", 14: "ten"}  # FRAME_CLASS
 
 
@@ -60,7 +61,7 @@ def read_dataflash(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
         if "TimeUS" not in fields:
             continue
         columns = {
-            field: rows[field].astype(float) * _SCALES.get(letter, 1.0)
+            field: numbers(rows[field]) * _SCALES.get(letter, 1.0)
             for field, letter in zip(fields, letters, strict=True)
             if letter not in "nNZa"
         }
@@ -79,23 +80,22 @@ def read_dataflash(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
 
 
 def _with_signals(outputs: Stream, parameters: Mapping[str, float], name: str, notes: list[str]) -> Stream:
-    functions = {}  # of an output that belongs to a motor, by the number of the motor
+    functions = {}  # the outputs of motors
     for key, value in parameters.items():
         found = re.fullmatch(r"SERVO(\d+)_FUNCTION", key)
-        if found and (33 <= value <= 40 or 82 <= value <= 85):
-            functions[int(value) - (32 if value < 41 else 73)] = int(found[1])
+        if found and value in _MOTORS:
+            functions[_MOTORS.index(int(value))] = int(found[1])
     frame = int(parameters.get("FRAME_CLASS", 1))
     if frame in _FRAMES or len(functions) > 4:
         many = _FRAMES.get(frame, str(len(functions)))
-        raise WrongMotors(
-            f"{name} is the log of a drone with {many} rotors (FRAME_CLASS {frame}). Only four are fitted."
-        )
+        said = f"{name} is the log of a drone with {many} rotors (FRAME_CLASS {frame})."
+        raise WrongMotors(f"{said} Only four are fitted.")
     low, high = parameters.get("MOT_PWM_MIN", 0.0), parameters.get("MOT_PWM_MAX", 0.0)
     low, high = (low or 1000.0), (high if high > low else 2000.0)
-    signals: dict[str, Array] = {}
+    signals = dict(outputs.columns)
     for k in range(4):
-        pulses = outputs.columns.get(f"RCOU.C{functions.get(k + 1, k + 1)}")
+        pulses = outputs.columns.get(f"RCOU.C{functions.get(k, k + 1)}")
         if pulses is not None:
             signals[f"RCOU.signal[{k}]"] = np.maximum((pulses - low) / (high - low), 0.0)
     notes.append(f"motor commands are outputs of RCOU, pulses from {low:g} to {high:g} us")
-    return Stream(outputs.name, outputs.time, {**outputs.columns, **signals})
+    return Stream(outputs.name, outputs.time, signals)

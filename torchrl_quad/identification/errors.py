@@ -8,6 +8,11 @@ from torchrl_quad.errors import UserValueError
 Remedy = Mapping[str, Any]  # see torchrl_quad.identification.remedies
 
 
+def in_units(quantity: str, when: str, **units: float) -> list[Remedy]:
+    """A remedy for each unit in which a quantity may be, by what turns it into ours."""
+    return [{"quantity": quantity, "factor": x, "when": f"{when} {unit}"} for unit, x in units.items()]
+
+
 class LogError(UserValueError):
     """A log cannot be used. Each of its classes names one reason, and each message what is odd; what it tells to write
     was tried on the log, and works."""

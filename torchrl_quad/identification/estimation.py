@@ -6,7 +6,8 @@ import dataclasses
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,24 +20,13 @@ from torchrl_quad.dynamics import MotorCommand, QuadrotorParams
 from torchrl_quad.dynamics.rigid_body import RigidBodyState
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.files import replacing
+from torchrl_quad.identification import prediction
 from torchrl_quad.identification.checks import turning_fits
 from torchrl_quad.identification.errors import TooShort
 from torchrl_quad.identification.fitting import MAX_ITERATIONS, Linear, Problem, State, bootstrap, covariance, minimise
 from torchrl_quad.identification.log import FlightLog
-from torchrl_quad.identification.parameters import FIELDS, UNKNOWNS, Model, report, unknowns_of
-from torchrl_quad.identification.prediction import (
-    CONSTANT_VELOCITY,
-    PAST,
-    Windows,
-    as_logs,
-    as_params,
-    carrying_speed,
-    cut,
-    predict,
-    rms_errors,
-    stream_delay,
-    trim,
-)
+from torchrl_quad.identification.parameters import FIELDS, NEED_MASS, UNKNOWNS, Estimate, Model, report, unknowns_of
+from torchrl_quad.identification.prediction import CONSTANT_VELOCITY, PAST, Windows
 from torchrl_quad.identification.result import IdentificationResult
 from torchrl_quad.options import Seed, checked
 
@@ -45,6 +35,7 @@ _MOST_WINDOWS = 360  # more would cost more and tell little more, since neighbou
 _HORIZONS = (0.1, 0.25, 0.5)  # [s], of the errors that are reported
 _BLOCK = 2.0  # [s] of flight that are held out together
 _EVERY_BLOCK = 5  # of which the last is held out
+_TENSORS = ("x", "streams")  # of a state
 _CONTRARY = 0.15  # correlation
 _MOST_TRIM = 0.2  # of the weight
 _MASS = "without a known mass, motion only tells its ratio to the mass, which `ratios` gives"
@@ -91,13 +82,13 @@ def identify(
         ValueError: a field cannot be fitted, or the drone is wrong, or a known value: its rotors turn it another way
             than the flights, or a fifth of its weight or more is left over.
     """
-    logs = as_logs(log, "identify")
+    logs = prediction.as_logs(log, "identify")
     if draws == 1:
         raise UserValueError("draws must be 0, for no bootstrap, or at least 2: one draw has no spread.")
     given = dict(known or {})
     delay = given.pop("command_delay", None)
-    prior = as_params(drone)
-    prior = as_params(prior.replace(**given)) if given else prior
+    prior = prediction.as_params(drone)
+    prior = prediction.as_params(prior.replace(**given)) if given else prior
     _check_turning(prior, logs)
     prior, motors = _with_motors(prior, logs, delay)
     unknowns = unknowns_of(fields)
@@ -109,7 +100,8 @@ def identify(
     step = min(x.dt * max(1, round(0.01 / x.dt)) for x in logs)
     seconds = sum((b - a) * x.dt for x in logs for a, b in x.segments)
     every = max(0.5 * horizon, seconds / _MOST_WINDOWS)
-    windows = cut(logs, horizon, past, every, max(1, round(_BODY_STEP / step)), motors.nominal_voltage)
+    stride = max(1, round(_BODY_STEP / step))
+    windows = prediction.cut(logs, horizon, past, every, stride, motors.nominal_voltage)
     held = held_out(windows)
     kept = windows.select(torch.nonzero(~held).flatten())
     if len(kept) < 2 * len(wanted) + 4:
@@ -138,16 +130,16 @@ def identify(
     left = _checked_trim(logs, fitted, past, "thrust" in state.free)
     errors, by_flight = _errors(logs, {"fitted": fitted, "prior": prior}, past, horizon)
     half = quantile * cover.diag()[n:].clamp_min(0.0).sqrt() * UNKNOWNS["stream"].scale
+    ends = zip(state.streams.tolist(), (state.streams - half).tolist(), (state.streams + half).tolist(), strict=True)
+    clocks = [Estimate(value=value, low=low, high=high, unit="s") for value, low, high in ends]
+    settings = {"past": past, "horizon": horizon, "seed": seed, "windows": len(kept), "held_out": int(held.sum())}
     return IdentificationResult(
         drone=fitted,
         prior=prior,
         has_mass=has_mass,
         parameters=parameters,
         ratios=ratios,
-        stream_delay={
-            log.name: {"value": float(s), "low": float(s - h), "high": float(s + h), "unit": "s"}
-            for log, s, h in zip(logs, state.streams, half, strict=True)
-        },
+        stream_delay={log.name: clock for log, clock in zip(logs, clocks, strict=True)},
         bootstrap=resampled,
         names=list(state.free),
         correlation=_correlation(cover[:n, :n]).tolist(),
@@ -156,15 +148,7 @@ def identify(
         errors=errors,
         errors_by_flight=by_flight,
         trim=left,
-        settings={
-            "past": past,
-            "horizon": horizon,
-            "seed": seed,
-            "windows": len(kept),
-            "held_out": len(windows) - len(kept),
-            "iterations": state.iteration,
-            "cost": state.cost,
-        },
+        settings=settings | {"iterations": state.iteration, "cost": state.cost},
         logs=[log.name for log in logs],
         flights=logs,
     )
@@ -178,7 +162,7 @@ def _with_motors(
     if motors is None:
         volts = [float(x.battery_voltage.mean()) for x in logs if x.battery_voltage is not None]
         nominal = float(np.mean(volts)) if volts else 1.0
-        motors = MotorCommand(float(np.mean([carrying_speed(prior, x, nominal) for x in logs])), nominal)
+        motors = MotorCommand(float(np.mean([prediction.carrying_speed(prior, x, nominal) for x in logs])), nominal)
     if delay is not None:
         motors = dataclasses.replace(motors, delay=delay)
     return dataclasses.replace(prior, motor_command=motors), motors
@@ -186,11 +170,13 @@ def _with_motors(
 
 def _check_turning(prior: QuadrotorParams, logs: Sequence[FlightLog]) -> None:
     """Refuse rotors whose places or spins turn the drone against what its flights show."""
-    places, spin = prior.rotor_positions.numpy(), prior.rotor_spin.numpy()
+    places, spin, mine = prior.rotor_positions.numpy(), prior.rotor_spin.numpy(), prediction.log_columns(prior)
     signs = np.stack((places[:, 1], -places[:, 0], spin))  # of roll, pitch and yaw
-    rows = [np.concatenate([np.arange(a, b) for a, b in x.segments]) for x in logs]
-    fits = np.mean([turning_fits(x.angular_velocity, x.motor_command, x.dt, r, signs)[0]
-                    for x, r in zip(logs, rows, strict=True)], 0)  # fmt: skip
+    each = []
+    for log in logs:
+        rows = np.concatenate([np.arange(start, stop) for start, stop in log.segments])
+        each.append(turning_fits(log.angular_velocity, log.motor_command[:, mine], log.dt, [rows], signs)[0, 0])
+    fits = np.mean(each, 0)
     if fits[2] < -_CONTRARY:
         raise UserValueError(
             f"identify: the rotors of these flights turn the other way than the drone's (correlation {fits[2]:.2f} "
@@ -199,8 +185,8 @@ def _check_turning(prior: QuadrotorParams, logs: Sequence[FlightLog]) -> None:
     if fits[:2].min() < -_CONTRARY:
         raise UserValueError(
             f"identify: motors turn these flights against where the drone's rotor_positions are (correlations "
-            f"{fits[0]:.2f} in roll, {fits[1]:.2f} in pitch). Name its rotors front left, back left, back right, front "
-            "right, as motors of a FlightLog are."
+            f"{fits[0]:.2f} in roll, {fits[1]:.2f} in pitch). Name the motors of the log front left, back left, back "
+            "right, front right, when it is read."
         )
 
 
@@ -208,16 +194,17 @@ def _checked_trim(
     logs: Sequence[FlightLog], fitted: QuadrotorParams, past: float, fits_thrust: bool
 ) -> dict[str, list[float]]:
     """The mean force and torque that the fitted drone leaves over, refused beyond a fifth of the weight."""
-    left = trim(logs, fitted, past)
+    left = prediction.trim(logs, fitted, past)
     if left is None:
         return {}
     force, torque = left.force.tolist(), left.torque.tolist()
-    if math.hypot(*force) > _MOST_TRIM:
+    share = math.hypot(*force)
+    if share > _MOST_TRIM:
         more = "" if fits_thrust else ' Or fit its thrust, too: name "thrust_map" in fields.'
+        along = ", ".join(f"{x:+.2f}" for x in force)
         raise UserValueError(
-            f"identify: {math.hypot(*force):.0%} of the drone's weight is left over ({force[0]:+.2f}, {force[1]:+.2f}, "
-            f"{force[2]:+.2f} along x, y, z): its mass of {float(fitted.mass):.3g} kg or its thrust is not that of "
-            f"these flights. Weigh it with its battery.{more}"
+            f"identify: {share:.0%} of the drone's weight is left over ({along} along x, y, z): its mass of "
+            f"{float(fitted.mass):.3g} kg or its thrust is not that of these flights. Weigh it with its battery.{more}"
         )
     return {"force_per_weight": force, "torque": torque}
 
@@ -242,7 +229,7 @@ class Fit:
 
     def run(self, wanted: list[str]) -> tuple[State, dict[str, str], str]:
         """Fit what is wanted; leave out what the flights do not tell; then ask for two time constants."""
-        streams = torch.tensor([stream_delay(log) for log in self.logs], dtype=torch.float64)
+        streams = torch.tensor([prediction.stream_delay(log) for log in self.logs], dtype=torch.float64)
         free, dropped = [x for x in wanted if x != "asymmetry"], {}
         x, near = self.model.only(free).start, min(4, self.iterations - 1)  # a later stage starts near its end
         while True:
@@ -262,10 +249,8 @@ class Fit:
         more = self._minimise(start, "two time constants")
         _, cover = self.uncertainty(more)
         ratio, error = float(more.x[-1]), float(cover[len(free), len(free)].sqrt())
-        said = (
-            f"rising / falling = {math.exp(ratio):.2f}, 95 % between {math.exp(ratio - 1.96 * error):.2f} and "
-            f"{math.exp(ratio + 1.96 * error):.2f}"
-        )
+        value, low, high = (math.exp(ratio + end * error) for end in (0.0, -1.96, 1.96))
+        said = f"rising / falling = {value:.2f}, 95 % between {low:.2f} and {high:.2f}"
         if abs(ratio) > 2.58 * error and abs(ratio) > math.log(1.2):
             return more, dropped, f"two time constants: {said}"
         return state, dropped, f"one time constant: {said}"
@@ -311,10 +296,8 @@ class Fit:
         unknown = UNKNOWNS[name]
         if excess[i] <= 1.0 and abs(float(state.x[i])) < unknown.limit:
             return self._impossible(state)
-        if unknown.is_log:
-            spread = f"its 95 % interval spans a factor of {math.exp(2 * min(half, 20.0)):.3g}"
-        else:
-            spread = f"its 95 % interval is {2 * half * unknown.scale:.3g} wide"
+        factor = f"spans a factor of {math.exp(2 * min(half, 20.0)):.3g}"
+        spread = f"its 95 % interval {factor if unknown.is_log else f'is {2 * half * unknown.scale:.3g} wide'}"
         correlation = _correlation(cover)[i, : len(state.x)].clone()
         correlation[i] = 0.0
         j = int(correlation.abs().argmax())
@@ -344,22 +327,19 @@ class Checkpoint:
     def resume(self, stage: str, start: State) -> State:
         """The last step of a stage, or its start."""
         found = self._read().get(stage)
-        try:
+        with self._named():
             if found is None or tuple(found["free"]) != start.free:
                 return start
-            x = torch.tensor(found["x"], dtype=torch.float64).reshape(start.x.shape)
-            streams = torch.tensor(found["streams"], dtype=torch.float64).reshape(start.streams.shape)
-            if not (x.isfinite().all() and streams.isfinite().all()):
+            old = {name: start.x.new_tensor(found[name]).reshape(getattr(start, name).shape) for name in _TENSORS}
+            if not all(x.isfinite().all() for x in old.values()):
                 raise ValueError("an unknown is not finite")
-            return State(**found | {"free": start.free, "x": x, "streams": streams})
-        except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError) as error:
-            raise self._broken(error) from error
+            return State(**found | {"free": start.free} | old)
 
     def write(self, stage: str, state: State) -> None:
         """Keep a step."""
         if self.path is None:
             return
-        entry = dataclasses.asdict(state) | {"x": state.x.tolist(), "streams": state.streams.tolist()}
+        entry = dataclasses.asdict(state) | {name: getattr(state, name).tolist() for name in _TENSORS}
         content = {"fingerprint": self.fingerprint, "stages": {**self._read(), stage: entry}}
         with replacing(self.path) as temporary:
             temporary.write_text(json.dumps(content))
@@ -367,14 +347,17 @@ class Checkpoint:
     def _read(self) -> dict[str, Any]:
         if self.path is None or not Path(self.path).is_file():
             return {}
-        try:
+        with self._named():
             content = json.loads(Path(self.path).read_text())
             return dict(content["stages"]) if content["fingerprint"] == self.fingerprint else {}
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise self._broken(error) from error
 
-    def _broken(self, error: object) -> UserValueError:
-        return UserValueError(f"{self.path} is not a checkpoint of a fit: {shown(error)}. Delete it to start again.")
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        try:
+            yield
+        except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError) as error:
+            said = f"{self.path} is not a checkpoint of a fit: {shown(error)}. Delete it to start again."
+            raise UserValueError(said) from error
 
 
 def held_out(windows: Windows) -> Tensor:
@@ -397,13 +380,13 @@ def _errors(
     table: dict[str, dict[str, dict[float, float]]] = {}
     flights: dict[str, dict[str, dict[str, float]]] = {log.name: {} for log in logs}
     for name, drone in {**drones, CONSTANT_VELOCITY: CONSTANT_VELOCITY}.items():
-        windows, flown, seen = predict(logs, drone, horizon, past, 0.1)
+        windows, *states = prediction.predict(logs, drone, horizon, past, 0.1)
         held = held_out(windows)
-        for k, log in [(None, None), *enumerate(logs)]:
-            own = held if k is None else held & (windows.log == k)
+        for k, log in enumerate([None, *logs], -1):
+            own = held if log is None else held & (windows.log == k)
             if own.any():
-                pair = (RigidBodyState(*(x[own] for x in states)) for states in (flown, seen))
-                errors = rms_errors(windows, *pair, horizons=horizons)
+                flown, seen = (RigidBodyState(*(x[own] for x in state)) for state in states)
+                errors = prediction.rms_errors(windows, flown, seen, horizons)
                 if log is None:
                     table[name] = errors
                 else:
@@ -416,9 +399,8 @@ def _not_identifiable(dropped: Mapping[str, str], has_mass: bool, fields: str | 
     found = {UNKNOWNS[name].number: reason for name, reason in dropped.items()}
     if not has_mass:
         found["mass"] = "motion does not tell it: weigh the drone, and give known={'mass': ...}"
-        for name in ("thrust_map", "linear_drag", "inertia"):
-            if fields is None or name in fields:
-                found.setdefault(name, _MASS)
+        asked = [name for name in NEED_MASS if fields is None or name in fields]
+        found |= {name: _MASS for name in asked if name not in found}
     return found
 
 

@@ -104,16 +104,15 @@ class Problem:
 
     def _spread(self, raw: Tensor) -> Tensor:
         """The standard deviation (m) of each residual, from medians; one for the three axes together."""
-        errors, push, gyro = raw.split((POINTS * 12, 6, POINTS * 3), 1)
-        errors, push, gyro = errors.unflatten(1, (POINTS, 4, 3)), push.unflatten(1, (2, 3)), gyro.unflatten(1, (-1, 3))
-        floor = raw.new_tensor(_FLOOR)[:, None]
-        spread = (1.4826 * errors.abs().median(0).values).mean(-1, keepdim=True).maximum(floor).expand(-1, -1, 3)
+        errors, push, turned = (1.4826 * raw.abs().median(0).values).split((POINTS * 12, 6, POINTS * 3))
+        each = errors.unflatten(0, (POINTS, 4, 3)).mean(-1, keepdim=True).maximum(raw.new_tensor(_FLOOR)[:, None])
         # Of the pushes, that along the thrust tells the level of thrust. The others are the drone's trim.
-        pushed = torch.full_like(push[0], torch.inf)
+        pushed = torch.full_like(push, torch.inf)
         if self.counts_push:
-            pushed[0, 2] = (1.4826 * push[:, 0, 2].abs().median()).clamp_min(_PUSH_FLOOR)
-        turned = (1.4826 * gyro.abs().median(0).values).mean().clamp_min(_FLOOR[2])
-        return torch.cat((spread.flatten(), pushed.flatten(), turned.expand(POINTS * 3)))
+            pushed[2] = push[2].clamp_min(_PUSH_FLOOR)
+        return torch.cat(
+            (each.expand(-1, -1, 3).flatten(), pushed, turned.mean().clamp_min(_FLOOR[2]).expand(POINTS * 3))
+        )
 
 
 def minimise(problem: Problem, state: State, report: Callable[[State], None], max_iterations: int) -> State:
@@ -175,10 +174,7 @@ def covariance(linear: Linear, log: Tensor, logs: int, lags: int) -> tuple[Tenso
     """
     hessian, _ = normal_equations(linear, log, logs)
     _, g = per_window(linear)
-    n = g.shape[1] - 1
-    scores = g.new_zeros(len(g), n + logs)
-    scores[:, :n] = g[:, :n]
-    scores[torch.arange(len(g)), n + log] = g[:, n]
+    scores = g.new_zeros(len(g), g.shape[1] - 1 + logs).scatter(1, _places(g, log), g)
     bread = _inverse(hessian)
     meat = scores.T @ scores
     for lag in range(1, lags + 1):
@@ -193,12 +189,9 @@ def covariance(linear: Linear, log: Tensor, logs: int, lags: int) -> tuple[Tenso
 def bootstrap(linear: Linear, log: Tensor, logs: int, block: int, draws: int, seed: int) -> Tensor:
     """Changes of the unknowns (draws, n + L) where blocks of windows are resampled, with one Gauss-Newton step each."""
     h, g = per_window(linear)
-    n = g.shape[1] - 1
-    place = torch.cat((torch.arange(n).expand(len(g), n), (n + log).unsqueeze(1)), 1)
-    hessians, scores = g.new_zeros(len(g), n + logs, n + logs), g.new_zeros(len(g), n + logs)
-    index = torch.arange(len(g))
+    size, place, index = g.shape[1] - 1 + logs, _places(g, log), torch.arange(len(g))
+    scores, hessians = g.new_zeros(len(g), size).scatter(1, place, g), g.new_zeros(len(g), size, size)
     hessians[index[:, None, None], place[:, :, None], place[:, None, :]] = h
-    scores[index[:, None], place] = g
     generator = torch.Generator().manual_seed(seed)
     blocks = -(-len(g) // block)
     changes = []
@@ -209,6 +202,12 @@ def bootstrap(linear: Linear, log: Tensor, logs: int, block: int, draws: int, se
         hessian = (counts[:, None, None] * hessians).sum(0)
         changes.append(-_inverse(hessian) @ (counts[:, None] * scores).sum(0))
     return torch.stack(changes)
+
+
+def _places(gradient: Tensor, log: Tensor) -> Tensor:
+    """Which unknowns (W, n + 1) of all (n + L) a window has: the coordinates, and its log's stream delay."""
+    n = gradient.shape[1] - 1
+    return torch.cat((torch.arange(n).expand(len(log), n), (n + log).unsqueeze(1)), 1)
 
 
 def _solve(hessian: Tensor, gradient: Tensor, damping: float) -> Tensor:

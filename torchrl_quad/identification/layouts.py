@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -101,13 +102,12 @@ def _as_columns(quantity: object, names: object) -> Columns:
                 f"{shown(names)}."
             )
         names = Columns((names,) if isinstance(names, str) else tuple(names))
-    known = [*QUANTITIES, "time"]
-    if not (isinstance(quantity, str) and (quantity in known or quantity.startswith("setpoint."))):
+    count, sizes = len(names.names), {**{name: size for name, (size, _) in QUANTITIES.items()}, "time": 1}
+    if not (isinstance(quantity, str) and (quantity in sizes or quantity.startswith("setpoint."))):
         raise MissingColumns(
-            f"Unknown quantity {shown(quantity)} in columns. Choose from: {', '.join(known)}, setpoint.NAME."
+            f"Unknown quantity {shown(quantity)} in columns. Choose from: {', '.join(sizes)}, setpoint.NAME."
         )
-    count = len(names.names)
-    size = 1 if quantity == "time" else QUANTITIES.get(quantity, (count, None))[0]
+    size = sizes.get(quantity, count)
     if count != size:
         raise MissingColumns(f"{quantity} takes {size} column(s), got {count}: {', '.join(names.names)}. Name each.")
     return names
@@ -230,12 +230,9 @@ def listed(names: Iterable[str], asked: Sequence[str], most: int = 2200) -> str:
         return f": {', '.join(there) or 'none'}"
     words = [set(_words(x)) for x in asked]
     rank = {x: max(len(w & set(_words(x))) / max(len(w), 1) for w in words) for x in there[: 10**4]}
-    kept, room = [], most
-    for x in sorted(rank, key=lambda x: -rank[x]):
-        room -= len(x) + 2
-        if room < 0:
-            break
-        kept.append(x)
+    ranked = sorted(rank, key=lambda x: -rank[x])
+    ends = itertools.accumulate(len(x) + 2 for x in ranked)
+    kept = [x for x, end in zip(ranked, ends, strict=True) if end <= most]
     return f" {len(there)}, of which these are most alike: {', '.join(kept)}"
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
@@ -15,7 +15,7 @@ from pydantic import Field
 from torchrl_quad.deploy.frames import Convention
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
 from torchrl_quad.identification import checks
-from torchrl_quad.identification.errors import GapsTooLarge, LogError, NoFlight, UnreadableLog, WrongUnit
+from torchrl_quad.identification.errors import GapsTooLarge, LogError, NoFlight, UnreadableLog, WrongUnit, in_units
 from torchrl_quad.identification.layouts import QUANTITIES, Columns, Layout, gather
 from torchrl_quad.identification.pieces import broken, find_pieces, motors_on
 from torchrl_quad.identification.remedies import Mended, remedy_for
@@ -27,6 +27,7 @@ from torchrl_quad.rotations import from_euler
 _LONGEST = 3000  # letters of an error: it lists up to 60 columns
 LEAST_STEP, MAX_STEPS = 1e-3, 1_000_000  # [s] of a log, and how many: 17 minutes at 1 kHz, half a gigabyte
 FULL_SPEED = 4000.0  # [rad/s], of which rotor speeds are given as shares where a file has them instead of commands
+_OPTIONAL = ("battery_voltage", "setpoint.")
 _FIELDS = [name for name in QUANTITIES if name not in ("euler", "velocity_body", "rotor_speed")]
 
 
@@ -100,13 +101,13 @@ def read_log(
     max_gap: NonNegative = 0.05,
     min_duration: NonNegative = 0.5,
 ) -> FlightLog:
-    """Read the log of a flight: CSV (also gz), PX4 ULog, ROS bag, or the uSD log of a Crazyflie.
+    """Read the log of a flight: CSV (also gz), PX4 ULog, ArduPilot dataflash log, ROS bag, or uSD log of a Crazyflie.
 
     Bags need rosbags: ``pip install '.[logs]'`` in a clone. ``docs/flight_logs.md`` has examples and limits.
 
     Args:
         path: a file, or the folder of a ROS 2 bag. Its first bytes say of what kind it is.
-        columns: which columns are which quantity: a preset's name ("nanobench", "px4", "crazyflie"), a
+        columns: which columns are which quantity: a preset's name ("nanobench", "px4", "ardupilot", "crazyflie"), a
             :class:`Layout`, or a mapping from quantities to names or :class:`Columns`, in the order of the convention.
             By default the kind of file and the header decide. A mapping replaces entries of the preset for the file,
             and None leaves one out; it describes all of a CSV file, if it names position, attitude and motors.
@@ -120,14 +121,15 @@ def read_log(
         min_duration: the shortest piece in flight that is kept [s].
 
     Raises:
-        LogError: the log cannot be used. Its subclasses name the reason.
+        LogError: the log cannot be used. Its subclasses name the reason, and what its message tells to write was tried.
     """
     path = Path(path)
-    options = {"onboard": onboard, "dt": dt, "clearance": clearance, "max_gap": max_gap, "min_duration": min_duration}
+    options: dict[str, Any] = {"onboard": onboard, "dt": dt, "clearance": clearance}
+    options |= {"max_gap": max_gap, "min_duration": min_duration}
     with _naming(path):
         streams, layout, notes = read_streams(path, columns)
         layout = layout if convention is None else replace(layout, convention=convention)
-        start = Mended(layout, options, {column for stream in streams for column in stream.columns})
+        start = Mended(layout, {column for stream in streams for column in stream.columns})
 
         def read(mended: Mended) -> FlightLog:
             factor = np.divide(mended.layout.time.scale, layout.time.scale)
@@ -135,7 +137,12 @@ def read_log(
             moved = streams
             if mended.layout.time != layout.time:
                 moved = [replace(stream, time=stream.time * factor - late) for stream in streams]
-            return _read(path, moved, mended.layout, list(notes), **mended.options)
+            given = {name: value for name, value in {**options, **mended.changes}.items() if name in options}
+            if "span" in mended.changes:
+                low, high = mended.changes["span"]
+                inside = [(stream.time >= low) & (stream.time <= high) for stream in moved]
+                moved = [stream.at(rows) for stream, rows in zip(moved, inside, strict=True)]
+            return _read(path, moved, mended.layout, list(notes), **given)
 
         try:
             return read(start)
@@ -156,16 +163,15 @@ def _read(
     clearance: float,
     max_gap: float,
     min_duration: float,
-    span: tuple[float, float] = (-np.inf, np.inf),
 ) -> FlightLog:
     """The flight in the streams of a file, as a layout says what they are."""
     fields = layout.onboard if onboard is None else tuple(onboard)
-    unknown = [field for field in fields if field not in (*_FIELDS, "setpoint")]
-    if unknown:
-        known = ", ".join([*_FIELDS, "setpoint"])
-        raise UserValueError(f"onboard: unknown field {shown(unknown[0])}. Choose from: {known}.")
-    signals = _signals(layout, [_within(stream, span) for stream in streams], path.name, notes)
-    main = [s for q, s in signals.items() if not _is_optional(q)]
+    known = [*_FIELDS, "setpoint"]
+    for field in fields:
+        if field not in known:
+            raise UserValueError(f"onboard: unknown field {shown(field)}. Choose from: {', '.join(known)}.")
+    signals = _signals(layout, streams, path.name, notes)
+    main = [signal for quantity, signal in signals.items() if not quantity.startswith(_OPTIONAL)]
     grid, step = _grid(signals, main, dt, path.name)
     valid = cover(main, grid, step, max_gap, notes)
     at = on_grid(signals, grid, step)
@@ -198,14 +204,6 @@ def _read(
     )
 
 
-def _within(stream: Stream, span: tuple[float, float]) -> Stream:
-    low, high = span
-    inside = (stream.time >= low) & (stream.time <= high)
-    if inside.all() or not np.isfinite(span).any():
-        return stream
-    return Stream(stream.name, stream.time[inside], {name: x[inside] for name, x in stream.columns.items()})
-
-
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
     """Put errors of a log in one line that names its file."""
@@ -215,10 +213,6 @@ def _naming(path: Path) -> Iterator[None]:
         said = str(error) if path.name in str(error) else f"{path.name}: {error}"
         said = " ".join("".join(x if x.isprintable() else " " for x in said).split())  # names may hold anything
         raise type(error)(said if len(said) <= _LONGEST else f"{said[:_LONGEST]} ...") from error
-
-
-def _is_optional(quantity: str) -> bool:
-    return quantity == "battery_voltage" or quantity.startswith("setpoint.")
 
 
 def _signals(layout: Layout, streams: Sequence[Stream], name: str, notes: list[str]) -> dict[str, Signal]:
@@ -246,7 +240,7 @@ def _signals(layout: Layout, streams: Sequence[Stream], name: str, notes: list[s
             norm = np.linalg.norm(signal.values, axis=-1, keepdims=True)
             unit = np.where(np.abs(norm - 1.0) < 0.05, signal.values / np.where(norm > 0.0, norm, 1.0), np.nan)
             signal = replace(signal, values=unit)
-        if _is_optional(quantity) and np.isfinite(signal.values).all(-1).sum() < 2:
+        if quantity.startswith(_OPTIONAL) and np.isfinite(signal.values).all(-1).sum() < 2:
             notes.append(f"{signal} holds no finite samples: left out")
             continue
         signals[quantity], dropped = clean(signal)
@@ -265,11 +259,8 @@ def _grid(signals: Mapping[str, Signal], main: Sequence[Signal], dt: float | Non
     attitude = signals["quaternion"]
     step = dt or max(round(attitude.step, 5), LEAST_STEP)
     if not 0.0 < attitude.step < 0.5:
-        units = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
-        raise WrongUnit(
-            f"{name}: the clock steps by {attitude.step:.4g} s, which is not a flight.",
-            *({"quantity": "time", "factor": x, "when": f"it is in {unit}"} for unit, x in units.items()),
-        )
+        units = in_units("time", "it is in", milliseconds=1e-3, microseconds=1e-6, nanoseconds=1e-9)
+        raise WrongUnit(f"{name}: the clock steps by {attitude.step:.4g} s, which is not a flight.", *units)
     start, stop = max(s.time[0] for s in main), min(s.time[-1] for s in main)
     span = stop - start
     if span < 20.0 * step:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple, NotRequired, TypedDict
+from collections.abc import Mapping, Sequence
+from typing import NotRequired, TypedDict
 
 import torch
 from torch import Tensor
@@ -25,11 +25,6 @@ class Unknown:
     wide: float = math.log(3.0)  #: half of a 95 % interval that is wider says that the flights do not tell it
     limit: float = math.inf  #: of the coordinate, either way
     scale: float = 1.0
-
-    @property
-    def field(self) -> str:
-        """The field of the drone."""
-        return self.number.partition(".")[0]
 
     @property
     def is_log(self) -> bool:
@@ -54,7 +49,11 @@ UNKNOWNS = {
 #: What ``fields`` of :func:`~torchrl_quad.identification.identify` may name, and the unknowns that each stands for.
 FIELDS: dict[str, tuple[str, ...]] = {}
 for _name, _unknown in UNKNOWNS.items():
-    FIELDS[_unknown.field] = (*FIELDS.get(_unknown.field, ()), _name)
+    _field = _unknown.number.partition(".")[0]
+    FIELDS[_field] = (*FIELDS.get(_field, ()), _name)
+
+
+_DRAG = ("drag_xy", "drag_xy", "drag_z")  # of each axis
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,26 +103,21 @@ class Model:
         k2 = c["thrust"].exp() * mass if "thrust" in c else prior.thrust_map[0]
         grown = k2 / prior.thrust_map[0]
         fields["thrust_map"] = prior.thrust_map * grown
-        if "asymmetry" in c:
-            half = 0.5 * c["asymmetry"]
-            fields["motor_time_constant"] = torch.stack([c["lag"] + half, c["lag"] - half]).exp()
-        elif "lag" in c:
-            fields["motor_time_constant"] = torch.stack([c["lag"]]).exp()
-        x_drag, y_drag, z_drag = prior.linear_drag
-        if "drag_xy" in c:
-            x_drag = y_drag = c["drag_xy"].exp() * mass
-        if "drag_z" in c:
-            z_drag = c["drag_z"].exp() * mass
-        fields["linear_drag"] = torch.stack([x_drag, y_drag, z_drag])
+        if "lag" in c:
+            halves = (0.5 * c["asymmetry"], -0.5 * c["asymmetry"]) if "asymmetry" in c else (0.0,)
+            fields["motor_time_constant"] = torch.stack([c["lag"] + half for half in halves]).exp()
+        drag = [c[x].exp() * mass if x in c else old for x, old in zip(_DRAG, prior.linear_drag, strict=True)]
+        fields["linear_drag"] = torch.stack(drag)
         if "height" in c:
             fields["drag_height"] = (c["height"] * UNKNOWNS["height"].scale).reshape(1)
         # Without its own unknown an inertia keeps its ratio to the thrust, which is what motion would fix.
         jx = arm[1] * k2 / c["roll"].exp() if "roll" in c else prior.inertia[0] * grown
         jy = arm[0] * k2 / c["pitch"].exp() if "pitch" in c else prior.inertia[1] * grown
-        ratio = c["z_ratio"].exp() if "z_ratio" in c else prior.inertia[2] / prior.inertia[:2].prod().sqrt()
-        if "z_ratio" not in c:
+        if "z_ratio" in c:
+            ratio = c["z_ratio"].exp()
+        else:
             low, high = _possible(jx, jy)
-            ratio = ratio.maximum(low).minimum(high)
+            ratio = (prior.inertia[2] / prior.inertia[:2].prod().sqrt()).maximum(low).minimum(high)
         if {"roll", "pitch", "z_ratio"} & set(c):
             fields["inertia"] = torch.stack([jx, jy, ratio * (jx * jy).sqrt()])
         if "yaw" in c:
@@ -174,38 +168,32 @@ class Estimate(TypedDict):
     prior: NotRequired[float]
 
 
-class _Number(NamedTuple):
-    """A number of a drone that is reported."""
+# By the number of a drone that is reported: its unit, its place in its field (as a part of it, if that has several),
+# and the factors with which coordinates add up to it; the first of them must have been fitted.
+_NUMBERS: dict[str, tuple[str, slice, dict[str, float]]] = {
+    "thrust_map": ("N s2 (k2)", slice(0, 1), {"thrust": 1.0}),
+    "motor_time_constant": ("s", slice(None), {"lag": 1.0}),
+    "motor_time_constant.rising": ("s", slice(0, 1), {"asymmetry": 0.5, "lag": 1.0}),
+    "motor_time_constant.falling": ("s", slice(-1, None), {"asymmetry": -0.5, "lag": 1.0}),
+    "linear_drag.xy": ("N s/m", slice(0, 2), {"drag_xy": 1.0}),
+    "linear_drag.z": ("N s/m", slice(2, 3), {"drag_z": 1.0}),
+    "drag_height": ("m", slice(0, 1), {"height": 1.0}),
+    "inertia.x": ("kg m2", slice(0, 1), {"roll": -1.0, "thrust": 1.0}),
+    "inertia.y": ("kg m2", slice(1, 2), {"pitch": -1.0, "thrust": 1.0}),
+    "inertia.z": ("kg m2", slice(2, 3), {"z_ratio": 1.0, "thrust": 1.0, "roll": -0.5, "pitch": -0.5}),
+    "yaw_torque_coefficient": ("m", slice(0, 1), {"yaw": 1.0, "z_ratio": 1.0, "roll": -0.5, "pitch": -0.5}),
+    "command_delay": ("s", slice(None), {"delay": 1.0}),
+}
+NEED_MASS = ("thrust_map", "linear_drag", "inertia")  #: fields of which motion only tells the ratio to the mass
 
-    factors: Mapping[str, float]  # with which coordinates add up to it; the first of them must have been fitted
-    unit: str
-    needs_mass: bool
-    of: Callable[[Plant], Tensor]
 
-
-_NUMBERS = {
-    "thrust_map": _Number({"thrust": 1.0}, "N s2 (k2)", True, lambda x: x.params.thrust_map[0]),
-    "motor_time_constant": _Number({"lag": 1.0}, "s", False, lambda x: x.params.motor_time_constant.log().mean().exp()),
-    "motor_time_constant.rising": _Number(
-        {"asymmetry": 0.5, "lag": 1.0}, "s", False, lambda x: x.params.motor_time_constant[0]
-    ),
-    "motor_time_constant.falling": _Number(
-        {"asymmetry": -0.5, "lag": 1.0}, "s", False, lambda x: x.params.motor_time_constant[-1]
-    ),
-    "linear_drag.xy": _Number({"drag_xy": 1.0}, "N s/m", True, lambda x: x.params.linear_drag[:2].mean()),
-    "linear_drag.z": _Number({"drag_z": 1.0}, "N s/m", True, lambda x: x.params.linear_drag[2]),
-    "drag_height": _Number({"height": 1.0}, "m", False, lambda x: x.params.drag_height[0]),
-    "inertia.x": _Number({"roll": -1.0, "thrust": 1.0}, "kg m2", True, lambda x: x.params.inertia[0]),
-    "inertia.y": _Number({"pitch": -1.0, "thrust": 1.0}, "kg m2", True, lambda x: x.params.inertia[1]),
-    "inertia.z": _Number(
-        {"z_ratio": 1.0, "thrust": 1.0, "roll": -0.5, "pitch": -0.5}, "kg m2", True, lambda x: x.params.inertia[2]
-    ),
-    "yaw_torque_coefficient": _Number(
-        {"yaw": 1.0, "z_ratio": 1.0, "roll": -0.5, "pitch": -0.5}, "m", False,
-        lambda x: x.params.yaw_torque_coefficient[0],
-    ),
-    "command_delay": _Number({"delay": 1.0}, "s", False, lambda x: x.delay),
-}  # fmt: skip
+def _number(plant: Plant, name: str) -> float:
+    """The number of a drone that goes by a name: the mean of its part of a field, of time constants the geometric."""
+    field = name.partition(".")[0]
+    if field == "command_delay":
+        return float(plant.delay)
+    part = getattr(plant.params, field)[_NUMBERS[name][1]]
+    return float(part.log().mean().exp() if name == "motor_time_constant" else part.mean())
 
 
 def report(
@@ -233,11 +221,11 @@ def report(
     inertia = fitted.params.inertia
     ratio = float(inertia[2] / inertia[:2].prod().sqrt())
     parameters: dict[str, Estimate] = {}
-    for name, number in _NUMBERS.items():
+    for name, (unit, _, factors) in _NUMBERS.items():
         replaced = name == "motor_time_constant" and "asymmetry" in place  # by two of them
-        if next(iter(number.factors)) in place and (has_mass or not number.needs_mass) and not replaced:
-            found = estimate(float(number.of(fitted)), number.unit, number.factors)
-            parameters[name] = {**found, "prior": float(number.of(prior))}
+        told = has_mass or name.partition(".")[0] not in NEED_MASS
+        if next(iter(factors)) in place and told and not replaced:
+            parameters[name] = {**estimate(_number(fitted, name), unit, factors), "prior": _number(prior, name)}
     ratios = {
         name: estimate(math.exp(float(x[place[unknown]])), unit, {unknown: 1.0})
         for name, (unknown, unit) in RATIOS.items()

@@ -66,21 +66,19 @@ def find_pieces(
             *shorter,
         )
     first, last = pieces[0][0], pieces[-1][1]
-    if resting[:first].any():
-        notes.append(f"take-off: cut out up to {first * dt:.2f} s, {clearance:g} m above the ground")
-    if resting[last:].any():
-        notes.append(f"landing: cut out from {last * dt:.2f} s, {clearance:g} m above the ground")
-    if not resting.any():
-        notes.append("the log holds no stand on the ground, so contact with it could not be looked for by height")
     low = (~flying)[first:last].sum() * dt
-    if low:
-        notes.append(f"{low:.2f} s between take-off and landing are within {clearance:g} m of the ground: cut out")
     total = sum(stop - start for start, stop in pieces) * dt
     short = (airborne & valid).sum() * dt - total
-    if short > dt / 2.0:
-        notes.append(f"{short:.2f} s in flight were left out: they come in pieces shorter than {min_duration:g} s")
-    notes.append(f"{total:.2f} s of {len(z) * dt:.2f} s are in flight, in {len(pieces)} piece(s)")
-    return pieces, notes
+    above = f"{clearance:g} m above the ground"
+    told = {
+        f"take-off: cut out up to {first * dt:.2f} s, {above}": resting[:first].any(),
+        f"landing: cut out from {last * dt:.2f} s, {above}": resting[last:].any(),
+        "the log holds no stand on the ground, so contact with it could not be looked for by height": not resting.any(),
+        f"{low:.2f} s between take-off and landing are within {clearance:g} m of the ground: cut out": low,
+        f"{short:.2f} s in flight were left out: they come in pieces shorter than {min_duration:g} s": short > dt / 2.0,
+        f"{total:.2f} s of {len(z) * dt:.2f} s are in flight, in {len(pieces)} piece(s)": True,
+    }
+    return pieces, [*notes, *(note for note, holds in told.items() if holds)]
 
 
 def _near_ground(z: Array, resting: Mask, clearance: float, name: str) -> Mask:

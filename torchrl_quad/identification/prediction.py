@@ -13,7 +13,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from torchrl_quad.allocation import quarters
+from torchrl_quad.airframe import quarters
 from torchrl_quad.dynamics import MotorCommand, QuadrotorParams, load_drone, quaternion
 from torchrl_quad.dynamics.rigid_body import RigidBodyState, Rotors, accelerations, rk4
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
@@ -101,8 +101,7 @@ def trim(logs: Sequence[FlightLog], drone: QuadrotorParams, past: float = PAST) 
         windows = cut(logs, 0.1, past or PAST, 0.1, nominal_voltage=motors.nominal_voltage)
     except TooShort:
         return None
-    late = torch.tensor([stream_delay(log) for log in logs], dtype=torch.float64)[windows.log]
-    plant = plant_of(drone, motors, late)
+    plant = plant_of(drone, motors, torch.tensor([stream_delay(log) for log in logs], dtype=torch.float64)[windows.log])
     force, torque = windows.push(plant, windows.rotor_speed(plant))
     return Push(force.mean(0) / drone.gravity, torque.mean(0))
 
@@ -133,15 +132,8 @@ def rms_errors(
 
 def differences(flown: RigidBodyState, seen: RigidBodyState) -> Tensor:
     """Predictions minus measurements (W, n, 4, 3), in the order of ``ERRORS``."""
-    return torch.stack(
-        (
-            flown.position - seen.position,
-            flown.velocity - seen.velocity,
-            rotation_vector(flown.quaternion, seen.quaternion),
-            flown.angular_velocity - seen.angular_velocity,
-        ),
-        -2,
-    )
+    position, _, velocity, rate = (x - y for x, y in zip(flown, seen, strict=True))
+    return torch.stack((position, velocity, rotation_vector(flown.quaternion, seen.quaternion), rate), -2)
 
 
 def as_params(drone: Any) -> QuadrotorParams:
@@ -149,20 +141,16 @@ def as_params(drone: Any) -> QuadrotorParams:
     drone = getattr(drone, "drone", drone)
     if not isinstance(drone, QuadrotorParams):
         drone = load_drone(drone, torch.float64)
-    if drone.rotor_spin.shape[-1] != 4:
-        raise UserValueError(
-            f"A FlightLog is of a drone with four rotors, and this one has {drone.rotor_spin.shape[-1]}."
-        )
     for name, value in drone.fields().items():
         if value.dim() != drone.dim(name):
             raise UserValueError(f"A flight is of one drone, and {name} has shape {tuple(value.shape)}, of several.")
-    columns(drone)
+    log_columns(drone)
     return drone.detach().to(dtype=torch.float64, device="cpu")
 
 
-def columns(drone: QuadrotorParams) -> list[int]:
+def log_columns(drone: QuadrotorParams) -> list[int]:
     """For each rotor, in whatever order the drone lists them, the column of its motor in a log: by its place."""
-    if found := quarters(drone.rotor_positions.detach().cpu().numpy()):
+    if found := quarters(drone.rotor_positions.tolist()):  # plain numbers, also under jacfwd
         return found
     raise UserValueError(
         "Flight logs hold the commands of four motors of an X: front left, back left, back right, front right. This "
@@ -251,7 +239,7 @@ class Windows:
         late = (plant.stream_delay - plant.delay) / self.dt
         command = self._between(self.command, self.start[:, None] + steps + 0.5 + late[:, None])
         slope, zero = (x.reshape(-1, 1, 1) for x in (plant.speed_per_volt, plant.speed_at_zero))
-        wanted = (zero + slope * command[..., columns(plant.params)]).clamp_min(0.0).unbind(1)
+        wanted = (zero + slope * command[..., log_columns(plant.params)]).clamp_min(0.0).unbind(1)
         rotors, speed, speeds = Rotors(plant.params), wanted[0], []
         for k, target in enumerate(wanted):
             if k >= warm:

@@ -23,59 +23,58 @@ _DEEPEST, _MOST = 4, 12  # faults of one log that are mended together, and how o
 
 @dataclass(frozen=True)
 class Mended:
-    """How a log is read: with which layout and options, and how they differ from what the caller gave."""
+    """How a log is read: with which layout, and how that and the options differ from what the caller gave."""
 
     layout: Layout
-    options: Mapping[str, Any]
     there: Collection[str]  #: the columns of the file
     columns: Mapping[str, Columns | None] = field(default_factory=dict)
-    changes: Mapping[str, Any] = field(default_factory=dict)
+    changes: Mapping[str, Any] = field(default_factory=dict)  #: of other arguments
     when: tuple[str, ...] = ()
     done: tuple[object, ...] = ()
 
-    def by(self, remedy: Remedy) -> Mended:
-        """With one more remedy."""
-        todo = dict(remedy)
+    def by(self, remedy: Remedy) -> Mended | None:
+        """With one more remedy; None where it was done, or the file does not have its quantity."""
+        axes = np.ndim(remedy.get("factor", 0.0))
+        kind = (remedy.get("quantity"), remedy.keys() - {"when"}, axes)
+        if kind in self.done or ("convention" in self.changes and ("convention" in remedy or axes)):
+            return None
+        todo, layout = dict(remedy), self.layout
         when = (*self.when, *filter(None, [todo.pop("when", "")]))
         quantity = todo.pop("quantity", None)
         if quantity is None:
-            layout = replace(self.layout, convention=todo["convention"]) if "convention" in todo else self.layout
-            options = {name: value for name, value in todo.items() if name != "convention"}
-            return replace(
-                self, layout=layout, options={**self.options, **options}, changes={**self.changes, **todo}, when=when
-            )
+            layout = replace(layout, convention=todo.get("convention", layout.convention))
+            return replace(self, layout=layout, changes={**self.changes, **todo}, when=when)
+        name = todo.get("name", quantity)
         if quantity == "time":
-            columns, name = _changed(self.layout.time, [0], todo), "time"
-            layout = self.layout if columns is None else replace(self.layout, time=columns)
+            columns = _changed(layout.time, [0], todo)
+            layout = replace(layout, time=columns)
         else:
-            choices = self.layout.columns[quantity]
-            used = next(c for c in choices if all(column in self.there for column in c.names))
-            columns = _changed(used, _places(self.layout.convention, quantity, len(used.names)), todo)
-            name = todo.get("name", quantity)
-            kept = {q: x for q, x in self.layout.columns.items() if q not in (quantity, name)}
-            layout = replace(self.layout, columns=kept if columns is None else {**kept, name: (columns,)})
-        own = {q: x for q, x in self.columns.items() if q != quantity}
-        done = (*self.done, _kind(remedy))
-        return replace(self, layout=layout, columns={**own, name: columns}, when=when, done=done)
+            choices = layout.columns.get(quantity, ())
+            used = next((c for c in choices if all(column in self.there for column in c.names)), None)
+            if used is None:
+                return None
+            places = _places(layout.convention, quantity, len(used.names))
+            columns = None if "drop" in todo else _changed(used, places, todo)
+            kept = {q: x for q, x in layout.columns.items() if q not in (quantity, name)}
+            layout = replace(layout, columns=kept if columns is None else {**kept, name: (columns,)})
+        others = {q: x for q, x in self.columns.items() if q != quantity}
+        return replace(self, layout=layout, columns={**others, name: columns}, when=when, done=(*self.done, kind))
 
     def told(self, asked: object) -> str:
         """What to write, for a caller who asked for some columns."""
-        parts = []
+        parts, span = [], self.changes.get("span")
         if self.columns:
-            given = asked if isinstance(asked, Mapping) else {}
-            given = {k: v for k, v in given.items() if k not in _ousted(self.columns)}
+            ousted = {rival for pair in RIVALS for rival in pair if set(pair) & set(self.columns)}
+            given = {k: v for k, v in asked.items() if k not in ousted} if isinstance(asked, Mapping) else {}
             entries = (f'"{name}": {_said(value)}' for name, value in {**given, **self.columns}.items())
             parts.append(f"columns={{{', '.join(entries)}}}")
-        span = self.changes.get("span")
         for name, value in self.changes.items():
-            if name == "convention":
-                parts.append(f"convention=frames.{value.name.lower()}()")
-            elif name != "span":
-                parts.append(f"{name}={value:g}")
+            if name != "span":
+                said = f"frames.{value.name.lower()}()" if name == "convention" else f"{value:g}"
+                parts.append(f"{name}={said}")
         condition = f"If {' and '.join(dict.fromkeys(self.when))}, write " if self.when else "Write "
-        write = f"{condition}{', '.join(parts)}." if parts else ""
-        part = "" if span is None else f"Its part from {span[0]:.6g} to {span[1]:.6g} s reads: cut the file there."
-        return " ".join(filter(None, (part, write)))
+        told = [f"Its part from {span[0]:.6g} to {span[1]:.6g} s reads: cut the file there."] if span else []
+        return " ".join(told + ([f"{condition}{', '.join(parts)}."] if parts else []))
 
 
 def remedy_for(error: LogError, start: Mended, read: Callable[[Mended], object]) -> Mended | None:
@@ -84,12 +83,11 @@ def remedy_for(error: LogError, start: Mended, read: Callable[[Mended], object])
 
     def found(error: LogError, before: Mended, depth: int) -> Mended | None:
         for remedy in error.remedies if depth else ():
-            turns = "convention" in remedy or ("factor" in remedy and np.ndim(remedy["factor"]))
-            if (turns and "convention" in before.changes) or _kind(remedy) in before.done:  # which is done
+            mended = before.by(remedy)
+            if mended is None:
                 continue
             if next(left) <= 0:
                 return None
-            mended = before.by(remedy)
             try:
                 read(mended)
             except LogError as further:
@@ -103,14 +101,6 @@ def remedy_for(error: LogError, start: Mended, read: Callable[[Mended], object])
     return found(error, start, _DEEPEST)
 
 
-def _kind(remedy: Remedy) -> object:
-    return remedy.get("quantity"), sorted(set(remedy) - {"when"}), np.ndim(remedy.get("factor", 0.0))
-
-
-def _ousted(columns: Collection[str]) -> set[str]:
-    return {rival for pair in RIVALS for rival in pair if set(pair) & set(columns)}
-
-
 def _places(convention: Convention, quantity: str, count: int) -> list[int]:
     """Where the file has each of our components."""
     if quantity == "quaternion" and convention.xyzw:
@@ -120,39 +110,24 @@ def _places(convention: Convention, quantity: str, count: int) -> list[int]:
     return list(range(count))
 
 
-def _changed(used: Columns, places: list[int], todo: Mapping[str, Any]) -> Columns | None:
-    if "drop" in todo:
-        return None
+def _changed(used: Columns, places: list[int], todo: Mapping[str, Any]) -> Columns:
     n = len(used.names)
-    scale, offset, factor, less = (np.broadcast_to(np.asarray(x, float), n).copy() for x in (
-        used.scale, used.offset, todo.get("factor", 1.0), todo.get("offset", 0.0)))  # fmt: skip
-    names = list(used.names)
-    order = todo.get("order", range(n))
-    old = names.copy(), scale.copy(), offset.copy()
-    for i, k in enumerate(order):
-        names[places[i]], scale[places[i]], offset[places[i]] = (x[places[k]] for x in old)
-        offset[places[i]] += less[i] / scale[places[i]]
-        scale[places[i]] *= factor[i]
-    return Columns(tuple(names), *(x[0] if (x == x[0]).all() else tuple(x.tolist()) for x in (scale, offset)))
+    given = used.scale, used.offset, todo.get("factor", 1.0), todo.get("offset", 0.0)
+    scale, offset, factor, less = (np.broadcast_to(np.asarray(x, float), n) for x in given)
+    source = np.arange(n)
+    source[places] = np.array(places)[list(todo.get("order", range(n)))]
+    factor, less = factor[np.argsort(places)], less[np.argsort(places)]
+    scale, offset = scale[source], offset[source] + less / scale[source]
+    names = tuple(used.names[k] for k in source)
+    return Columns(names, *(x[0] if (x == x[0]).all() else tuple(x.tolist()) for x in (scale * factor, offset)))
 
 
 def _said(value: object) -> str:
-    """As it is written in Python."""
     if not isinstance(value, Columns):
         return repr(value)
-    parts = [repr(value.names)]
+    said = repr(value.names)
     for name, usual in (("scale", 1.0), ("offset", 0.0)):
         x = getattr(value, name)
         if x != usual:
-            parts.append(f"{name}=({', '.join(map(_number, x))})" if isinstance(x, tuple) else f"{name}={_number(x)}")
-    return f"Columns({', '.join(parts)})"
-
-
-def _number(x: float) -> str:
-    for text, value in (("np.pi / 180", np.pi / 180.0), ("-np.pi / 180", -np.pi / 180.0)):
-        if np.isclose(x, value, rtol=1e-12, atol=0.0):
-            return text
-    share = round(1.0 / x) if x else 0
-    if len(f"{x:g}") > 5 and share and np.isclose(x, 1.0 / share, rtol=1e-12, atol=0.0):
-        return f"1 / {share}"
-    return f"{x:.10g}"
+            said += f", {name}={f'{x:.10g}' if isinstance(x, float) else tuple(float(f'{y:.10g}') for y in x)}"
+    return f"Columns({said})"

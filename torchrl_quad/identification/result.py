@@ -31,14 +31,7 @@ _RANDOMISED = {
     "yaw_torque_coefficient": ("yaw_torque_coefficient",),
     "drag_height": ("drag_height",),
 }
-# Of a picture: the rows with their labels, and the seconds of a flight that are drawn.
-_ROWS = {
-    "position": "{} position [m]",
-    "velocity": "{} velocity [m/s]",
-    "tilt": "{} [deg]",
-    "body_rate": "{} rate [rad/s]",
-}
-_SECONDS = 8.0
+_SECONDS = 8.0  # of a flight that are drawn
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +56,7 @@ class IdentificationResult:
     #: by model, quantity and horizon [s], in held-out windows
     errors: Mapping[str, Mapping[str, Mapping[float, float]]]
     errors_by_flight: Mapping[str, Mapping[str, Mapping[str, float]]]  #: by flight, model and quantity, at the horizon
-    #: what the fitted drone leaves over on average, body frame: ``force_per_weight`` (3), and ``torque`` (3) [rad/s2]
+    #: ``force_per_weight`` (3) and ``torque`` (3) [rad/s2] that the fitted drone leaves over on average, body frame
     trim: Mapping[str, Sequence[float]]
     settings: Mapping[str, Any]  #: of the fit
     logs: Sequence[str]  #: names of the flights
@@ -81,9 +74,8 @@ class IdentificationResult:
         return f"after {horizon:g} s the fit predicts better than constant velocity in all"
 
     def __str__(self) -> str:
-        lines = [
-            f"{len(self.logs)} flight(s), {self.settings['windows']} windows, {self.settings['held_out']} held out"
-        ]
+        used, held = self.settings["windows"], self.settings["held_out"]
+        lines = [f"{len(self.logs)} flight(s), {used} windows, {held} held out"]
         for title, table in (("parameters", self.parameters), ("ratios", self.ratios), ("clock", self.stream_delay)):
             lines += [f"{title}, with 95 % intervals:"] if table else []
             for name, x in table.items():
@@ -115,26 +107,19 @@ class IdentificationResult:
                 least, most = LIMITS[field]
                 found[field] = {"uniform": [max(least, own[0]["low"]), min(most, own[0]["high"])]}
             elif own:
-                found[field] = {
-                    "scale": [min(x["low"] / x["value"] for x in own), max(x["high"] / x["value"] for x in own)]
-                }
+                low, high = ([x[end] / x["value"] for x in own] for end in ("low", "high"))
+                found[field] = {"scale": [min(low), max(high)]}
         return found
 
     def as_yaml(self) -> str:
         """The drone as a file that :func:`~torchrl_quad.load_drone` takes."""
         content: dict[str, Any] = {}
         for name, value in self.drone.fields().items():
-            plain = [_rounded(x) for x in value.reshape(-1).tolist()]
-            if name == "rotor_positions":
-                content[name] = [[_rounded(x) for x in place] for place in value.tolist()]
-            else:
-                content[name] = plain[0] if len(plain) == 1 else plain
-        motors = self.drone.motor_command
-        if motors is not None:
-            content["motor_command"] = {k: _rounded(v) for k, v in dataclasses.asdict(motors).items()}
+            content[name] = _rounded(value.item() if value.numel() == 1 else value.tolist())
+        if self.drone.motor_command is not None:
+            content["motor_command"] = {k: _rounded(v) for k, v in vars(self.drone.motor_command).items()}
         head = [f"# Fitted to {', '.join(self.logs)}."]
-        if not self.has_mass:
-            head.append("# The mass is the prior's: only ratios to it were fitted.")
+        head += [] if self.has_mass else ["# The mass is the prior's: only ratios to it were fitted."]
         head += [f"# Not fitted: {name}: {reason}." for name, reason in self.not_identifiable.items()]
         return "\n".join(head) + "\n" + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=110)
 
@@ -174,19 +159,17 @@ class IdentificationResult:
             windows, flown, seen = predict(self.flights[:1], drone, horizon, past, every=horizon)
             count = min(len(windows), round(_SECONDS / horizon))
             time = windows.dt * (windows.start[:count, None].numpy() + np.arange(windows.future + 1))
-            for (row, quantity), pair in zip(_ROWS.items(), axes, strict=True):
-                for k, ax in enumerate(pair):
-                    name = ("roll", "pitch")[k] if row in ("tilt", "body_rate") else "xy"[k]
-                    real, guess = (_component(x, row, k)[:count] for x in (seen, flown))
-                    if color == BLUE:  # the last
-                        ax.set_ylabel(quantity.format(name), fontsize=8)
-                        ax.tick_params(labelsize=7)
-                        ax.grid(alpha=0.3, linewidth=0.5)
-                        ax.plot(time.T, real.T, color=INK, linewidth=1.6, alpha=0.55)
-                        margin = 0.25 * (real.max() - real.min()) + 1e-3
-                        ax.set_ylim(real.min() - margin, real.max() + margin)
-                    ax.plot(time.T, guess.T, color=color, linewidth=0.9)
-                    ax.plot([], [], color=color, label=label)
+            for ax, (name, real), guess in zip(axes.flat, _curves(seen).items(), _curves(flown).values(), strict=True):
+                real, guess = real[:count], guess[:count]
+                if color == BLUE:  # the last
+                    ax.set_ylabel(name, fontsize=8)
+                    ax.tick_params(labelsize=7)
+                    ax.grid(alpha=0.3, linewidth=0.5)
+                    ax.plot(time.T, real.T, color=INK, linewidth=1.6, alpha=0.55)
+                    margin = 0.25 * (real.max() - real.min()) + 1e-3
+                    ax.set_ylim(real.min() - margin, real.max() + margin)
+                ax.plot(time.T, guess.T, color=color, linewidth=0.9)
+                ax.plot([], [], color=color, label=label)
         axes[0, 0].plot([], [], color=INK, linewidth=1.6, alpha=0.55, label="flight")
         axes[0, 0].legend(fontsize=7, frameon=False, ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0))
         for ax in axes[-1]:
@@ -215,14 +198,15 @@ class IdentificationResult:
         save(figure, path, dpi=110)
 
 
-def _component(states: RigidBodyState, row: str, k: int) -> Array:
-    if row == "tilt":
-        w, x, y, z = states.quaternion.unbind(-1)
-        sine = 2.0 * (w * y - x * z) if k else 2.0 * (w * x + y * z)  # of pitch, and of a small roll
-        return np.degrees(np.arcsin(np.clip(sine.numpy(), -1.0, 1.0)))
-    values = states.angular_velocity if row == "body_rate" else getattr(states, row)
-    return values[..., k].numpy()
+def _curves(states: RigidBodyState) -> dict[str, Array]:
+    """What a picture shows of states, (W, n) each, by its label."""
+    w, x, y, z = states.quaternion.unbind(-1)
+    sines = {"roll": 2.0 * (w * x + y * z), "pitch": 2.0 * (w * y - x * z)}  # of a small roll, and of pitch
+    curves = {f"{'xy'[k]} position [m]": states.position[..., k].numpy() for k in range(2)}
+    curves |= {f"{'xy'[k]} velocity [m/s]": states.velocity[..., k].numpy() for k in range(2)}
+    curves |= {f"{name} [deg]": np.degrees(np.arcsin(np.clip(x.numpy(), -1.0, 1.0))) for name, x in sines.items()}
+    return curves | {f"{name} rate [rad/s]": states.angular_velocity[..., k].numpy() for k, name in enumerate(sines)}
 
 
-def _rounded(value: float) -> float:
-    return float(f"{value:.6g}")
+def _rounded(value: Any) -> Any:
+    return [_rounded(x) for x in value] if isinstance(value, list) else float(f"{value:.6g}")

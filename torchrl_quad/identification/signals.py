@@ -44,6 +44,10 @@ class Stream:
     time: Array  # (N,) [s], from any start
     columns: Mapping[str, Array]  # each (N,), by the name that a layout uses
 
+    def at(self, rows: Mask) -> Stream:
+        """Some of its samples."""
+        return replace(self, time=self.time[rows], columns={name: x[rows] for name, x in self.columns.items()})
+
 
 @dataclass(frozen=True)
 class Signal:

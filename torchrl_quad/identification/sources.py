@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import collections
+import contextlib
 import gzip
 import io
 import itertools
@@ -22,7 +23,7 @@ from torchrl_quad.identification.bags import MAGIC, read_bag
 from torchrl_quad.identification.dataflash import HEAD, read_dataflash
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog
 from torchrl_quad.identification.layouts import LAYOUTS, NEEDED, Asked, Layout, blackbox, choose, listed, match
-from torchrl_quad.identification.signals import MAX_COLUMNS, Array, Stream, open_plain, too_many
+from torchrl_quad.identification.signals import MAX_COLUMNS, Stream, open_plain, too_many
 
 Read = tuple[list[Stream], Layout, list[str]]
 # Of a file, which may be packed, and of what it unpacks to. All is read in time and memory proportional to its size.
@@ -111,7 +112,14 @@ def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
     if repeated:
         raise UnreadableLog(f"{name} has several columns of one name: {', '.join(repeated)}. Rename them.")
     place = {column: k for k, column in enumerate(header) if column in asked}
-    table = _numbers(itertools.chain(samples, rows), mark, len(header), list(place.values()), name)
+    flat, pick = array("d"), itemgetter(*place.values(), place[clock])  # of a single place it would not give a tuple
+    for k, row in enumerate(itertools.chain(samples, rows)):
+        picked = pick(_cells(row, mark, len(header), name, k))[:-1]
+        try:
+            flat.extend([float(cell) for cell in picked])
+        except ValueError:
+            flat.extend([_number(cell, mark) for cell in picked])
+    table = np.frombuffer(flat).reshape(-1, len(place))
     values = dict.fromkeys(header, np.broadcast_to(np.nan, len(table)))  # the others are never read
     values |= dict(zip(place, table.T, strict=True))
     time = (values[clock] - np.asarray(layout.time.offset)) * np.asarray(layout.time.scale)
@@ -119,15 +127,11 @@ def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
 
 
 def _preset(header: list[str], name: str, columns: Asked) -> Layout | None:
-    """What a mapping changes; None for one that describes the whole file."""
+    """What a mapping changes; None for one that describes the whole file, or will be told what it lacks."""
     if not isinstance(columns, Mapping) or all(set(columns) & set(quantities) for quantities in NEEDED):
         return None
-    try:
+    with contextlib.suppress(MissingColumns) if "position" in columns else contextlib.nullcontext():
         return match(header, name)
-    except MissingColumns:
-        if "position" in columns:
-            return None  # of which it will be told what it lacks
-        raise
 
 
 def _rows(lines: Iterator[bytes], name: str) -> Iterator[str]:
@@ -160,18 +164,6 @@ def _mark(header: str) -> str | None:
     """What separates the cells; None is white space."""
     mark = max(",;\t", key=header.count)
     return mark if mark in header else None
-
-
-def _numbers(rows: Iterator[str], mark: str | None, width: int, places: list[int], name: str) -> Array:
-    """Some columns of a table (N, len(places))."""
-    flat, pick = array("d"), itemgetter(*places, places[0])  # of a single place it would not give a tuple
-    for k, row in enumerate(rows):
-        picked = pick(_cells(row, mark, width, name, k))[:-1]
-        try:
-            flat.extend([float(cell) for cell in picked])
-        except ValueError:
-            flat.extend([_number(cell, mark) for cell in picked])
-    return np.frombuffer(flat).reshape(-1, len(places))
 
 
 def _cells(row: str, mark: str | None, width: int, name: str, k: int) -> list[str]:

@@ -88,8 +88,8 @@ def takes_rollout(forward: Callable[..., Any]) -> Callable[..., Any]:
 def picked(tensordict: TensorDictBase, keys: Iterable[NestedKey], where: Tensor) -> TensorDict:
     """Some entries of a rollout (*, horizon) where bool (*, horizon, 1) says so: (n)."""
     rows = where.squeeze(-1).nonzero(as_tuple=True)  # once for all entries: to a compiler each mask has a count anew
-    found: dict[Any, Tensor] = {key: leaf(tensordict, key)[rows] for key in keys if key in tensordict}
-    return TensorDict(found, rows[0].shape, tensordict.device)
+    found = {key: leaf(tensordict, key)[rows] for key in keys if key in tensordict}
+    return TensorDict(cast(Any, found), rows[0].shape, tensordict.device)
 
 
 def with_fixed(loss: Any, given: Mapping[str, Any], **fixed: Any) -> dict[str, Any]:
@@ -187,14 +187,6 @@ def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: Ten
         if hasattr(plain, "replay"):
             return plain.replay(tensordict)
         return act(plain, tensordict.select(*plain.in_keys).detach(), plain.drawn_again(tensordict))
-
-
-def distribution_again(
-    actor: TensorDictModule, params: TensorDictParams, tensordict: TensorDictBase
-) -> tuple[Tensor, Tensor]:
-    """loc and scale, before the tanh, in a rollout's states, (*, k); otherwise as :func:`act_again`."""
-    with params.to_module(actor):
-        return plain_of(actor, tensordict).distribution(tensordict)
 
 
 def plain_of(actor: TensorDictModule, tensordict: TensorDictBase) -> Any:

@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
-from tensordict.utils import NestedKey, expand_as_right, unravel_key
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives.utils import ValueEstimators, distance_loss
 
 from torchrl_quad.data.unwrap import check_tensordict, group, leaf
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.objectives.calls import (
-    picked,
-    predict,
-    segments,
-    takes_rollout,
-    td_lambda,
-)
+from torchrl_quad.objectives.calls import picked, predict, segments, takes_rollout, td_lambda
 from torchrl_quad.objectives.pathwise import PathwiseLoss
 
 
@@ -98,7 +92,7 @@ class PathwiseCriticLoss(PathwiseLoss):
             if self._counts(data) is not None:
                 for name in ("reward", "done", "terminated"):
                     data.set(("next", getattr(self.tensor_keys, name)), self._next(data, name))
-            if torch.compiler.is_compiling():
+            if torch.compiler.is_compiling() and not getattr(self._value_estimator, "average_rewards", False):
                 numbers = self._gamma, self._of_returns("lmbda")
                 target = td_lambda(self._next(data, "reward"), self._next(data, "done"), next_value, *numbers)
             else:
@@ -153,10 +147,8 @@ class PathwiseCriticLoss(PathwiseLoss):
         discount = self._gamma * self._discounts(tensordict)
         if torch.compiler.is_compiling() and not self.samples_actions:
             # All states, since a compiler is slow where a mask gives the shape; earlier ones stand in for the others.
-            keys = [key for key in inputs if key in states]
-            both = ((leaf(states, key), leaf(tensordict, key).detach()) for key in keys)
-            rows = (torch.where(expand_as_right(where.squeeze(-1), x), x, other) for x, other in both)
-            dense = TensorDict(dict(zip(keys, rows, strict=True)), tensordict.shape).reshape(-1)
+            known, stand_in = (td.select(*inputs, strict=False) for td in (states, tensordict.detach()))
+            dense = cast(TensorDictBase, known.where(where.squeeze(-1), stand_in).reshape(-1))
             value = self._value(dense, target=self.target_bootstrap).view(where.shape).to(discount.dtype)
             return (discount * torch.where(where, value, 0.0)).sum((-2, -1))
         next_state = picked(states, inputs, where)

@@ -38,12 +38,12 @@ class GaussianPolicy:
         if sampler is None:
             raise Unsupported(f"{_NEEDED}; {type(actor).__name__} has no distribution. {_INSTEAD}")
         self.actor, self.sampler, self.action_key = actor, sampler, sampler.dist_sample_keys[0]
-        parts = list(actor.modules())
-        for part in parts[parts.index(sampler) + 1 :]:
+        parts = list(actor.named_modules())
+        for name, part in parts[[part for _, part in parts].index(sampler) + 1 :]:
             if isinstance(part, TensorDictModuleBase) and self.action_key in part.out_keys:
                 raise Unsupported(
-                    f"{_NEEDED}, and here {type(part).__name__} changes the action afterwards. Let the distribution "
-                    "write the action that is flown."
+                    f"{_NEEDED}, and here {type(part).__name__} ({name}) changes the action afterwards. "
+                    "Let the distribution write the action that is flown."
                 )
         self.flown = self._distribution(tensordict.select(*sampler.in_keys).detach())
         self.squashes = isinstance(self.flown, TanhNormal)
@@ -81,7 +81,7 @@ class GaussianPolicy:
         states = cast(TensorDictBase, states if has_memory else states.reshape(-1))  # as it was flown
         with set_exploration_type(ExplorationType.DETERMINISTIC), set_recurrent_mode(has_time):
             loc, scale = _normal(self._distribution(self._call(states)))
-        return loc.view(*shape, -1), scale.view(*shape, -1)
+        return loc.reshape(*shape, -1), scale.reshape(*shape, -1)
 
     def replay(self, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
         """What it writes in the states of a rollout (*, horizon), with the noise of the rollout."""
@@ -98,14 +98,16 @@ class GaussianPolicy:
         """What the policy writes in states; an error for a layer that would not write the same again."""
         names, before = {part: name for name, part in self.actor.named_modules()}, {}
         for part in names:
+            if isinstance(part, ProbabilisticTensorDictModule) and part is not self.sampler:
+                raise _changing(part, names[part], "draws random numbers")
             if isinstance(part, _BatchNorm) and (part.training or part.running_mean is None):
                 raise _changing(part, names[part], "uses the statistics of its batch")
         if torch.compiler.is_compiling():
             return self.actor(states)
 
         def leave(part: nn.Module, *_: Any) -> None:  # the innermost part returns first
-            for does, now, then in zip(_CHANGES, _changeable(part), before[part], strict=True):
-                if now != then:
+            for does, now in _changeable(part).items():
+                if now != before[part][does]:
                     raise _changing(part, names.get(part, ""), does)
 
         enter = register_module_forward_pre_hook(lambda part, _: before.update({part: _changeable(part)}))
@@ -132,15 +134,15 @@ def _normal(dist: Any) -> tuple[Tensor, Tensor]:
     return base.loc, base.scale
 
 
-_CHANGES = ("draws random numbers", "changes its statistics")
-
-
-def _changeable(part: nn.Module) -> tuple[Any, Any]:
-    """Where torch's generators stand, and how often the statistics of a part were changed in place."""
+def _changeable(part: nn.Module) -> dict[str, list[Any]]:
+    """Where torch's generators stand, and how often a part's statistics were changed in place; by what moves it."""
     devices = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
     random = torch.get_rng_state(), *(torch.cuda.get_rng_state(i) for i in devices)
     statistics = (x for x in part._buffers.values() if x is not None and x.is_floating_point())
-    return [x.numpy().tobytes() for x in random], [x._version for x in statistics]
+    return {
+        "draws random numbers": [x.numpy().tobytes() for x in random],
+        "changes its statistics": [x._version for x in statistics],
+    }
 
 
 def _changing(part: nn.Module, name: str, does: str) -> Unsupported:

@@ -18,13 +18,7 @@ from torchrl.objectives.utils import ValueEstimators
 
 from torchrl_quad.data.unwrap import check_tensordict, group, leaf
 from torchrl_quad.errors import UserValueError, WrongState
-from torchrl_quad.objectives.calls import (
-    action_gradient,
-    discounts,
-    plain_of,
-    segments,
-    takes_rollout,
-)
+from torchrl_quad.objectives.calls import action_gradient, discounts, plain_of, segments, takes_rollout
 from torchrl_quad.objectives.shac import SHACLoss
 from torchrl_quad.options import Below1, Coefficient, Field, Positive, Share
 
@@ -65,6 +59,7 @@ class HybridLoss(SHACLoss):
         entropy_coeff: the weight of the entropy bonus, next to advantages of standard deviation 1; 0 for none.
         clip_action_gradient: the longest gradient in one action, in running medians of their lengths; null for none.
         reduction: mean, sum or none, over samples.
+        loss_function: the distance of the critic from its targets: l2, its square; l1; or smooth_l1.
         decay: the share of the running weight that a rollout leaves as it is.
         average: of a scalar over the processes that train together, if there are several.
     """
@@ -100,7 +95,8 @@ class HybridLoss(SHACLoss):
         super().__init__(actor_network, value_network, delay_value=False, **own)
         self.gradient_lmbda, self.clip_epsilon, self.entropy_coeff = gradient_lmbda, clip_epsilon, entropy_coeff
         self.decay, self.average = decay, average
-        self.out_keys = [name for name in self.out_keys if name != "clipped"]  # minibatches clip no gradient
+        self.measured_of_actions = []  # minibatches clip no gradient
+        self.out_keys = [name for name in self.out_keys if name != "clipped"]
         self.out_keys += ["entropy"] * (entropy_coeff > 0)
         weight = torch.full((), math.nan, device=self._default_device, dtype=self._precision)
         self.register_buffer("pathwise_weight", weight)

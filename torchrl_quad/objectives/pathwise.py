@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Self, cast
 
@@ -18,14 +17,7 @@ from torchrl.objectives.utils import ValueEstimators, default_value_kwargs, disp
 
 from torchrl_quad.data.unwrap import check_tensordict, leaf
 from torchrl_quad.errors import Unsupported, UserTypeError, UserValueError, WrongState, shown
-from torchrl_quad.objectives.calls import (
-    MedianClip,
-    act_again,
-    action_gradient,
-    discounts,
-    takes_rollout,
-    total,
-)
+from torchrl_quad.objectives.calls import MedianClip, act_again, action_gradient, discounts, takes_rollout, total
 from torchrl_quad.objectives.gaussian import sampler_of
 from torchrl_quad.options import Coefficient, Entry, Fraction, Positive, Scale, between, check_value, checked
 
@@ -120,11 +112,9 @@ class PathwiseLoss(LossModule):
         if alpha == "auto" or alpha > 0:
             self._add_entropy_bonus()
 
-    def convert_to_functional(
-        self, module: TensorDictModule | Sequence[TensorDictModule], module_name: str, *args: Any, **kwargs: Any
-    ) -> None:
+    def convert_to_functional(self, module: Any, module_name: str, *args: Any, **kwargs: Any) -> None:
         """As TorchRL's, for a TensorDictModule, or for a list of networks that differ in their weights alone."""
-        networks = list(module) if isinstance(module, list | tuple) else [module]
+        networks: list[Any] = list(module) if isinstance(module, list | tuple) else [module]
         for network in networks:
             if not isinstance(network, TensorDictModuleBase):
                 raise UserTypeError(

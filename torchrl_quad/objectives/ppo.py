@@ -13,7 +13,7 @@ from torchrl.modules import ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss, distance_loss
 
 from torchrl_quad.data.unwrap import group, leaf
-from torchrl_quad.objectives.calls import plain_of, segments
+from torchrl_quad.objectives.calls import segments
 
 
 class PlainClipPPOLoss(ClipPPOLoss):
@@ -28,11 +28,15 @@ class PlainClipPPOLoss(ClipPPOLoss):
         options: those of ClipPPOLoss that the recipe takes.
     """
 
+    critic_coeff: Tensor  # pyrefly: ignore[bad-override-mutable-attribute]
+    entropy_coeff: Tensor  # pyrefly: ignore[bad-override-mutable-attribute]
+    max_importance_ratio: Tensor | None  # pyrefly: ignore[bad-override-mutable-attribute]
+
     def __init__(
         self, actor_network: ProbabilisticActor, critic_network: ValueOperator, *, compile: bool = False, **options: Any
     ) -> None:
         super().__init__(actor_network, critic_network, **options)
-        plain: Any = None if hasattr(actor_network, "replayed") else plain_of(actor_network)
+        plain: Any = None if hasattr(actor_network, "replayed") else getattr(actor_network, "plain", lambda: None)()
         predict, names = cast("Any", critic_network).plain(), [name for name, _ in critic_network.named_parameters()]
 
         def actor(weights: list[Tensor], inputs: list[Tensor], drawn: list[Tensor], *flown: Tensor) -> Any:
@@ -43,7 +47,7 @@ class PlainClipPPOLoss(ClipPPOLoss):
                 found |= {"entropy": entropy, "loss_entropy": -self.entropy_coeff * entropy}
             return found["loss_objective"] + found.get("loss_entropy", 0.0), found
 
-        def values(weights: list[Tensor], inputs: list[Tensor]) -> Tensor:
+        def values(weights: Sequence[Tensor], inputs: list[Tensor]) -> Tensor:
             return predict(dict(zip(names, weights, strict=True)), inputs)
 
         def critic(weights: list[Tensor], inputs: list[Tensor], target: Tensor) -> Any:
@@ -53,7 +57,7 @@ class PlainClipPPOLoss(ClipPPOLoss):
             return self.critic_coeff * loss, 1.0 - left / (whole + torch.finfo(target.dtype).eps)
 
         self._plain, self._values, self._critic_weights = plain, values, list(critic_network.parameters())
-        both: list[Any] = [grad_and_value(x, has_aux=True) for x in (actor, critic)]
+        both = [grad_and_value(cast("Any", x), has_aux=True) for x in (actor, critic)]
         self._actor, self._critic = (
             [torch.compile(x, fullgraph=True, dynamic=False) for x in both] if compile and plain else both
         )
@@ -70,16 +74,17 @@ class PlainClipPPOLoss(ClipPPOLoss):
     def warm_up(self, rollout: TensorDictBase, samples: int) -> None:
         """Compile for minibatches of so many samples, like those of a rollout (*, horizon)."""
         if self._plain is not None:
-            data, keys = self.write_values(rollout.copy()).reshape(-1), self.tensor_keys
+            data, keys = cast("TensorDict", self.write_values(rollout.copy()).reshape(-1)), self.tensor_keys
             for key in (keys.advantage, keys.value_target):
                 data.set(key, leaf(data, keys.value))
             self(data[torch.zeros(samples, dtype=torch.long, device=data.device)])
 
+    # pyrefly: ignore[bad-override-mutable-attribute]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """ClipPPOLoss's entries and ``loss_actor``, of samples (*) with ``advantage`` and ``value_target``."""
         plain, keys = self._plain, self.tensor_keys
         if plain is None:
-            losses = super().forward(tensordict)
+            losses = cast("Any", super().forward)(tensordict)
             return losses.set("loss_actor", losses["loss_objective"] + losses.get("loss_entropy", 0.0))
         inputs = [leaf(tensordict, key) for key in plain.in_keys]
         flown = [leaf(tensordict, key) for key in ("action", cast("str", keys.sample_log_prob), keys.advantage)]
@@ -89,7 +94,7 @@ class PlainClipPPOLoss(ClipPPOLoss):
         loss_critic, _, explained = self.loss_critic(tensordict)
         return TensorDict({**found, "loss_actor": loss, "loss_critic": loss_critic, "explained_variance": explained})
 
-    def loss_critic(self, tensordict: TensorDictBase) -> tuple[Tensor, None, Tensor]:
+    def loss_critic(self, tensordict: TensorDictBase) -> tuple[Any, ...]:
         """The critic's mean loss of samples, nothing, and the share of the variance that it explains."""
         inputs = [leaf(tensordict, key) for key in self.critic_network.in_keys]
         target = leaf(tensordict, self.tensor_keys.value_target)

@@ -7,7 +7,7 @@ const flight = JSON.parse(element("flight").textContent);
 const { environments, frames, ended, endings } = flight;
 const [position, attitude, lift, target, gate, allRings, places, path, rotors] = ["position", "quaternion", "lift", "target",
   "gate", "gates", "places", "curve", "rotors"].map((name) => decoded(flight[name]));
-const shapes = flight.shapes.map((shape) => ({ ...shape, points: decoded(shape.points), faces: decoded(shape.faces) }));
+const allShapes = flight.shapes.map((shape) => ({ ...shape, points: decoded(shape.points), faces: decoded(shape.faces) }));
 const obstacles = flight.obstacles.map(({ points, faces }) => ({ points: decoded(points), faces: decoded(faces) }));
 const images = flight.images && Uint8Array.from(atob(flight.images.data), (c) => c.charCodeAt(0));
 const times = Float64Array.from({ length: frames }, (_, k) => flight.start + k * flight.control_dt);
@@ -15,7 +15,7 @@ const times = Float64Array.from({ length: frames }, (_, k) => flight.start + k *
 const RED = "#c8452f", ORANGE = "#e8912d", INK = "#222222", PALE = "#dcdfe3";
 const CURVES = [INK, "#2f6db5", "#e8912d", "#3a9a5b", "#c8452f", "#8a5fb0", "#8c6d4f", "#d17ba6", "#5bb0c0"];
 const RING = 33; // points around a gate
-let rings = ringsOf(null);
+let rings = ringsOf(null), shapes = shapesOf(null);
 const TRAIL = Math.min(Math.round(2 / flight.control_dt), frames - 1); // steps behind a drone
 
 const everyone = Array.from({ length: environments }, (_, i) => i);
@@ -96,6 +96,14 @@ function ringsOf(i) {
   return allRings ? allRings.subarray(size * (flight.tracks > 1 ? i ?? 0 : 0)).subarray(0, size) : null;
 }
 
+// And the shapes around them.
+function shapesOf(i) {
+  const size = allShapes.length / flight.tracks;
+  return allShapes.slice(size * (flight.tracks > 1 ? i ?? 0 : 0)).slice(0, size);
+}
+
+const shapeTrace = (shape, k) => object({ ...shape, name: shape.name || `shape ${k}` });
+
 function drawNextGates(pen) {
   const next = new Set((flight.tracks > 1 ? [chosen ?? 0] : shown()).map((i) => gate[i * frames + Math.floor(frame)]));
   for (let g = 0; g < rings.length / (3 * RING); g++) drawRing(pen, next.has(g) ? g : null);
@@ -146,7 +154,7 @@ const trailColors = () => each(TRAIL + 3, (i) => (shown().includes(i) ? colors[i
 const MOVING = ["shadow", "trail", "body", "nose", ...(lift ? ["thrust"] : []), ...(target && !gate ? ["target"] : []),
   ...(gate ? ["next"] : []), "crash"];
 const [low, high] = bounds(...[position, target, allRings, places, path].filter(Boolean),
-  ...shapes.map((shape) => shape.points));
+  ...allShapes.map((shape) => shape.points));
 const extent = Math.max(...high.map((value, j) => value - low[j]), 1);
 const grounded = low[2] < 2 * extent; // otherwise the ground is too far below to be shown
 
@@ -231,7 +239,7 @@ function obstacle() {
 // What the task's markers name.
 function taskMarkers() {
   const named = shapes.filter((shape) => shape.name);
-  return [...shapes.map(object), ...(obstacles.length ? [obstacle()] : []),
+  return [...shapes.map(shapeTrace), ...(obstacles.length ? [obstacle()] : []),
     ...(named.length ? [labels("names", named.map((shape) => shape.name), named.map((shape) => shape.points))] : []),
     ...(rings ? gates() : []), ...(places ? [markers("places", through(places), "#e9b8ae", "diamond", 5)] : []),
     ...(path ? [line("path", through(path), "#e9b8ae", 2)] : target && !gate ? [course()] : [])];
@@ -426,8 +434,10 @@ function choose(i) {
     Plotly.restyle("space", { x: [x], y: [y], z: [z] }, [indexOf("course")]);
   }
   if (rings && flight.tracks > 1) {
-    rings = ringsOf(i);
-    for (const { name, x, y, z } of gates()) Plotly.restyle("space", { x: [x], y: [y], z: [z] }, [indexOf(name)]);
+    [rings, shapes] = [ringsOf(i), shapesOf(i)];
+    for (const { name, x, y, z } of [...gates(), ...shapes.map(shapeTrace)]) {
+      Plotly.restyle("space", { x: [x], y: [y], z: [z] }, [indexOf(name)]);
+    }
   }
   if (obstacles.length > 1) {
     const { x, y, z, i: a, j: b, k: c } = obstacle();

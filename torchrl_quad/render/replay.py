@@ -130,7 +130,7 @@ def _content(flight: Flight) -> dict[str, Any]:
         "gate": frames(flight.gate_index()),
         "places": markers.places,
         "curve": markers.curve,
-        "shapes": [vars(shape) for shape in markers.shapes],
+        "shapes": [vars(shape) for i in of_each for shape in flight.markers_of(i).shapes],
         "obstacles": _obstacles(flight),
         "images": _images(flight, first),
         "panels": [panel(label, lines) | options for label, lines, options in _panels(flight)],

@@ -18,9 +18,11 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torchrl import torchrl_logger
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.objectives import LossModule
 from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
 
 import torchrl_quad
 from torchrl_quad import (
@@ -137,7 +139,8 @@ class Run:
         way = "inside" if self.task.flies_inside(self.actor) else "before"
         name = f"{self.cfg.algorithm} {self.cfg.task} {self.cfg.seed}, policy {way} the step"
         bounds = {"total": self.total_steps, "initial": self.steps}
-        with tqdm(**bounds, unit="step", unit_scale=True, desc=name, disable=rank() > 0) as bar:
+        bar = tqdm(**bounds, unit="step", unit_scale=True, desc=name, disable=rank() > 0)
+        with logging_redirect_tqdm([torchrl_logger]), bar:  # TorchRL's lines go above the bar
             while self.steps < self.total_steps:
                 self.starts.append(self.carry["state", "position"].clone())
                 for optimizer in (x for x in self.stateful if isinstance(x, Optimizer)):
@@ -215,16 +218,15 @@ class Run:
 
     def _warm_up(self) -> None:
         """Compile all that the loop will call, before the clock starts; change nothing."""
-        loss = self.loss if isinstance(self.loss, PathwiseLoss) else None
-        before = copy.deepcopy(self.loss.state_dict())
-        seed, has_gradient = self.cfg.eval.seed, torch.set_grad_enabled(loss is not None)
-        with torch.random.fork_rng(), drawing_from(self.env, seed), has_gradient:
+        loss, before = cast("Any", self.loss), copy.deepcopy(self.loss.state_dict())
+        has_gradient = torch.set_grad_enabled(isinstance(loss, PathwiseLoss))
+        with torch.random.fork_rng(), drawing_from(self.env, self.cfg.eval.seed), has_gradient:
             rollout, _ = differentiable_rollout(self.env, self.actor, self.carry, min(self.cfg.horizon, 2))
-            if loss is not None:
+            if isinstance(loss, PathwiseLoss):
                 loss.loss_actor(rollout)[0].backward()
                 loss.zero_grad()
-            if hasattr(self.loss, "warm_up"):
-                self.loss.warm_up(rollout, min(self.cfg.batch_size, self.cfg.num_envs * self.cfg.horizon))
+            elif hasattr(loss, "warm_up"):
+                loss.warm_up(rollout, min(self.cfg.batch_size, self.cfg.num_envs * self.cfg.horizon))
         self.loss.load_state_dict(before)  # such as running means
 
     def _evaluate(self) -> dict[str, float]:

@@ -32,7 +32,7 @@ class Simulator:
 
     version: str  #: name and version
     loops: tuple[str, ...] = tuple(LOOPS)  #: the rate loops that it can fly with
-    lacks: frozenset[str] = frozenset()  #: what it cannot fly of :func:`special`
+    lacks: frozenset[str] = frozenset()  #: of ``special(drone)``, what it cannot fly
 
     def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
         self.substeps = max(round(1000.0 * contract["control_dt"]), 1)

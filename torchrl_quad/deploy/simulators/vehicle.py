@@ -8,8 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_quad.airframe import Array, RateLoop
-from torchrl_quad.allocation import matrix
+from torchrl_quad.airframe import Array, RateLoop, matrix
 from torchrl_quad.deploy.contract import Contract
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.rotations import cross, rotate, rotate_inverse
@@ -19,7 +18,7 @@ class Drone:
     """A drone from the fields of a contract's ``drone``: what :class:`~torchrl_quad.QuadrotorParams` documents.
 
     Attributes:
-        allocation: (6, n), from rotor thrusts [N] to force and torque, see :func:`torchrl_quad.allocation.matrix`.
+        allocation: (6, n), from rotor thrusts [N] to force and torque, see :func:`torchrl_quad.airframe.matrix`.
         mixer: (n, 4), the pseudo-inverse of its first four rows.
         thrust_limits: the least and the greatest thrust [N] that may be commanded of one rotor.
         motor_time_constant: of rotors that speed up, and of those that slow down (2) [s].

@@ -1,0 +1,225 @@
+"""What mappings of other projects say of a drone, and what their files have in common."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrl_quad.dynamics import presets
+from torchrl_quad.dynamics.parameters import FIELDS
+from torchrl_quad.errors import UserValueError, one_line
+
+Array = NDArray[np.float64]
+Found = dict[str, tuple[Any, str]]  # of a field: its value, None where there is none, and a note
+RPM = math.pi / 30.0  # [rad/s]
+READABLE = (
+    "These can be read: URDF, SDF, YAML of Flightmare and Agilicious, TOML of drone-models and Crazyflow, JSON of l2f "
+    "(rl-tools) and of RotorPy's quad_params, and our own YAML and TOML."
+)
+AXES = ("xx", "yy", "zz", "xy", "xz", "yz")
+
+
+def read_text(path: Path) -> str:
+    """The content of a file of a reasonable size."""
+    if not path.is_file():  # which a pipe or a device is not, whose reading may never end
+        raise FileNotFoundError(f"No drone file at {path}. Give the path of a file that exists.")
+    with path.open("rb") as file:
+        content = file.read(presets.MAX_BYTES + 1)
+    if len(content) > presets.MAX_BYTES:
+        raise UserValueError(f"{path}: has more than {presets.MAX_BYTES:,} bytes. A drone needs less.")
+    return content.decode("utf-8-sig", "replace")
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file."""
+    text = read_text(path)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise UserValueError(f"{path}: not a JSON file: {one_line(error)}.") from None
+
+
+class Said:
+    """The numbers of a mapping, by name; it keeps account of the names that were asked for."""
+
+    def __init__(self, data: Mapping[str, Any], source: str) -> None:
+        self.data, self.source, self.asked = data, source, set[str]()
+
+    def __call__(self, name: str, *shape: int | None) -> Any:
+        """An array of this shape, in which None is any length; or None, where the mapping has no such name."""
+        self.asked.add(name)
+        if (value := self.data.get(name)) is None:
+            return None
+        value = list(value.values()) if isinstance(value, Mapping) else value  # of rotors, r1, r2 and so on
+        try:
+            array = presets.as_array(value)
+        except (ValueError, RecursionError) as error:
+            raise UserValueError(f"{self.source}: {name!r}: {one_line(error)}.") from None
+        if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
+            want = ", ".join("n" if n is None else str(n) for n in shape)
+            raise UserValueError(f"{self.source}: {name!r} has shape {array.shape}; it must be ({want}).")
+        return array
+
+    def fields(self, **names: str) -> Found:
+        """Fields that the mapping has under other names, as they are."""
+        shapes = {x: () if FIELDS[x]["shape"] == (1,) else FIELDS[x]["shape"] for x in names}
+        return {x: (self(name, *(None if n == "n" else n for n in shapes[x])), "") for x, name in names.items()}
+
+
+def placed(positions: Array, directions: Array | None = None, note: str = "") -> Found:
+    """Where rotors (n, 3) are, and where they point if they are tilted; of upright ones the height does not count."""
+    if directions is None or np.allclose(directions[:, :2], 0.0, atol=1e-6):
+        return {"rotor_positions": (positions[:, :2], note)}
+    return {"rotor_positions": (positions, note), "rotor_direction": (directions, "")}
+
+
+def diagonal(matrix: Any, note: str = "") -> Found:
+    """The diagonal of an inertia (3, 3), if its axes are nearly the principal ones."""
+    if matrix is None or not matrix.any():
+        return {}
+    products = abs(matrix - np.diag(np.diag(matrix))).max()
+    if products > 0.05 * np.diag(matrix).min():
+        return {
+            "inertia": (
+                None,
+                f"its products of inertia are not small, {products:.2g} kg m2; give it about principal axes",
+            )
+        }
+    left = f"products of inertia up to {products:.2g} kg m2 left out" if products > 1e-6 * matrix.max() else ""
+    return {"inertia": (np.diag(matrix), "; ".join(x for x in (note, left) if x))}
+
+
+def symmetric(xx: Any, yy: Any, zz: Any, xy: Any, xz: Any, yz: Any) -> Array:
+    """An inertia (3, 3), from its moments and products."""
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], float)
+
+
+def same(values: Any, what: str) -> tuple[Any, str]:
+    """The value that all rotors have; none, with the reason, if they differ."""
+    values = np.asarray(values, float)
+    same = np.allclose(values, values[:1], rtol=1e-6, atol=0.0)
+    return (values[0], "") if same else (None, f"rotors differ in {what}, and must not")
+
+
+def speed_at(force: Any, curve: Sequence[float]) -> float:
+    """Of a rotor that thrusts with a force [N], by a thrust map."""
+    k2, k1, k0 = curve
+    root = math.sqrt(max(k1 * k1 + 4.0 * k2 * (force - k0), 0.0))
+    return float(2.0 * (force - k0) / max(k1 + root, 1e-12))
+
+
+def add_drag(found: Found, sides: float | None, up: float | None) -> None:
+    """The linear drag of rotors whose drag grows with their speed [N s2/(m rad)], at hover."""
+    mass, curve, places = (found.get(x, (None,))[0] for x in ("mass", "thrust_map", "rotor_positions"))
+    if sides is not None and mass and curve is not None and places is not None:
+        total = len(places) * speed_at(9.81 * mass / len(places), curve)
+        found["linear_drag"] = total * np.array([sides, sides, up or 0.0]), "the rotors', at hover"
+
+
+# -- mappings ----------------------------------------------------------------------------------------------------------
+
+
+def _flightmare(said: Said) -> Found:
+    names = {"yaw_torque_coefficient": "kappa", "motor_time_constant": "motor_tau", "max_body_rate": "omega_max"}
+    names |= {"rotor_speed_min": "motor_omega_min", "rotor_speed_max": "motor_omega_max"}
+    found = said.fields(mass="mass", inertia="inertia", thrust_map="thrust_map", **names)
+    mass, speed, most, arm = found["mass"][0], found["rotor_speed_max"][0], said("thrust_max"), said("arm_l")
+    drags = [said("aero_coeff_1", 3), said("body_drag_1", 3), *(said(f"aero_coeff_{axis}_1") for axis in "xyz")]
+    if drags[2] is not None and drags[3] is not None:
+        drags.append(np.array([drags[2], drags[3], drags[4] or 0.0]))
+    found["linear_drag"] = next((x for x in drags if x is not None and x.ndim), None), ""
+    if found["thrust_map"][0] is None and most is not None and speed is not None:
+        found["thrust_map"] = [most / speed**2, 0.0, 0.0], "from thrust_max at motor_omega_max, as the square of speed"
+    places = [said(f"tbm_{where}", 3) for where in ("fr", "bl", "br", "fl")]
+    if all(x is not None for x in places):
+        found |= placed(np.stack(places), note="front right, back left, back right, front left")
+        found["rotor_spin"] = [-1, -1, 1, 1], "of Agilicious's allocation, not in the file"
+    elif arm is not None:
+        found |= placed(
+            arm * math.sqrt(0.5) * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]), note="arm_l at 45 degrees"
+        )
+        found["rotor_spin"] = [1, -1, 1, -1], "of Flightmare's allocation, not in the file"
+        if found["inertia"][0] is None and mass is not None:
+            found["inertia"] = mass / 12.0 * arm**2 * np.array([4.5, 4.5, 7.0]), "of mass and arm_l, as in Flightmare"
+    return found
+
+
+def _l2f(said: Said) -> Found:
+    gravity, curves = said("gravity", 3), said("rotor_thrust_coefficients", None, 3)
+    turn = np.array([1.0, -1.0, -1.0]) if gravity is not None and gravity[2] > 0.0 else np.ones(3)  # z points down
+    names = ("rotor_positions", "rotor_thrust_directions", "rotor_torque_directions")
+    places, up, torque = (None if (x := said(name, None, 3)) is None else x * turn for name in names)
+    limit, kappa = said("action_limit", None), said("rotor_torque_constants", None)
+    times = [said(f"rotor_time_constants_{name}", None) for name in ("rising", "falling")]
+    said.asked |= {"J_inv", "hovering_throttle_relative"}
+    found = said.fields(mass="mass") | diagonal(said("J", 3, 3)) | ({} if places is None else placed(places, up))
+    if up is not None and torque is not None:
+        found["rotor_spin"] = np.sign((up * torque).sum(-1)), ""
+    if gravity is not None:
+        found["gravity"] = np.linalg.norm(gravity), ""
+    if kappa is not None:
+        found["yaw_torque_coefficient"] = same(kappa, "rotor_torque_constants")
+    if times[0] is not None and times[1] is not None:
+        found["motor_time_constant"] = same(np.stack(times, -1), "their time constants")
+    if curves is not None and limit is not None and limit.size == 2:
+        scale, note = (1000.0, "of a throttle of 0 to 1, times 1000") if max(limit) <= 1.0 else (1.0, "")
+        curve, why = same(curves, "rotor_thrust_coefficients")
+        found["thrust_map"] = (None, why) if curve is None else (curve[::-1] / [scale**2, scale, 1.0], note)
+        found |= {f"rotor_speed_{end}": (scale * x, note) for end, x in zip(("min", "max"), sorted(limit), strict=True)}
+    return found
+
+
+def _drone_models(said: Said) -> Found:
+    found = said.fields(mass="mass", yaw_torque_coefficient="thrust2torque", motor_time_constant="thrust_tau")
+    found |= diagonal(said("J", 3, 3))
+    arm, mix, gravity = said("L"), said("mixing_matrix", 3, None), said("gravity_vec", 3)
+    force, torque = said("rpm2thrust", 3), said("rpm2torque", 3)
+    curve = None if force is None else force[::-1] / [RPM**2, RPM, 1.0]
+    found["thrust_map"] = curve, ""
+    if gravity is not None:
+        found["gravity"] = np.linalg.norm(gravity), ""
+    if mix is not None and arm is not None:
+        found |= placed(arm * np.stack([-mix[1], mix[0]], -1), note="L times the mixing matrix")
+        found["rotor_spin"] = np.sign(mix[2]), ""
+    ends = (("rotor_speed_min", said("thrust_min")), ("rotor_speed_max", said("thrust_max")))
+    for end, newton in ends:
+        if newton is not None and curve is not None:
+            found[end] = speed_at(newton, curve), f"at {newton:g} N"
+    mass = found["mass"][0]
+    known = curve is not None and not any(x is None for x in (mass, mix, torque))
+    if known and found["yaw_torque_coefficient"][0] is None:
+        powers = (speed_at(9.81 * mass / mix.shape[1], curve) / RPM) ** np.arange(3)
+        found["yaw_torque_coefficient"] = torque @ powers / (force @ powers), "rpm2torque per rpm2thrust, at hover"
+    return found
+
+
+def _rotorpy(said: Said) -> Found:
+    names = {x: x for x in ("mass", "rotor_speed_min", "rotor_speed_max")}
+    found = said.fields(motor_time_constant="tau_m", rotor_spin="rotor_directions", **names)
+    moments, drag = [said(f"I{axes}") for axes in AXES], [said(f"c_D{axis}") for axis in "xyz"]
+    k2, torque, places = said("k_eta"), said("k_m"), said("rotor_pos", None, 3)
+    said.asked.add("num_rotors")
+    found |= {} if places is None else placed(places)
+    if all(x is not None for x in moments[:3]):
+        found |= diagonal(symmetric(*(x or 0.0 for x in moments)))
+    if all(x is not None for x in drag):
+        found["quadratic_drag"] = np.array(drag), ""
+    if k2 is not None:
+        found["thrust_map"] = [k2, 0.0, 0.0], ""
+        found["yaw_torque_coefficient"] = (None if torque is None else torque / k2), "k_m per k_eta"
+        add_drag(found, said("k_d"), said("k_z"))
+    return found
+
+
+MAPPINGS: dict[str, tuple[Any, ...]] = {  # by kind: how it is read, and names that no other kind has
+    "Flightmare or Agilicious": (_flightmare, "tbm_fr", "arm_l", "motor_omega_max", "motor_tau"),
+    "l2f": (_l2f, "rotor_thrust_coefficients", "rotor_torque_directions"),
+    "drone-models": (_drone_models, "rpm2thrust", "mixing_matrix"),
+    "RotorPy": (_rotorpy, "k_eta", "rotor_pos"),
+}

@@ -2,12 +2,14 @@
 
 import functools
 import importlib
+import math
 import platform
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import torch
 from refusals import cases
 
 from torchrl_quad.files import machine, read_rows
@@ -40,6 +42,7 @@ def run(tmp_path, monkeypatch):
     ("throughput", "--num-envs 4 --modes eager --horizon 2 --rounds 1", 9),
     ("memory", "--num-envs 4 --modes eager --horizon 2 --rounds 1", 1),
     pytest.param("camera", "--primitives 2 --scenes trees --images 2x4x3 --rounds 1", 1, marks=pytest.mark.slow),
+    ("racing", f"--tracks visfly --steps 16 --episodes 2 --cores 1 --runs runs --overrides {SMALL}", 1),
     ("time_to_solve", f"--algorithms bptt --modes eager --overrides {SMALL} total_steps=16", 1),
     ("profile_recipes", f"--algorithms bptt --iterations 2 --skip 1 --overrides {SMALL}", 1),
     pytest.param("identification", "--seeds 1 --seconds 10", 10, marks=pytest.mark.slow),  # it simulates a flight
@@ -47,7 +50,7 @@ def run(tmp_path, monkeypatch):
     ("identified_training", f"{ONE} --drones before=cf2x --judge crazyflie --tasks hovering --no-compile", 2),
 )
 @pytest.mark.usefixtures("quick_fits")
-def test_a_benchmark_writes_a_table(name, arguments, rows, run, tmp_path, monkeypatch):
+def test_a_benchmark_writes_a_table(name, arguments, rows, run, run_here, tmp_path, monkeypatch):
     (tmp_path / "flights").mkdir()
     for flight in ("circle", "figure8"):  # one to fit, and one that judges
         (tmp_path / f"flights/{flight}.csv.gz").symlink_to(BENCHMARKS.parent / "examples/data/figure8.csv.gz")
@@ -56,6 +59,8 @@ def test_a_benchmark_writes_a_table(name, arguments, rows, run, tmp_path, monkey
         if hasattr(module, "identify"):
             quick = functools.partial(module.identify, fields=["linear_drag"], iterations=1, draws=2)
             monkeypatch.setattr(module, "identify", quick)
+        if name == "racing":
+            monkeypatch.setattr(module, "run", run_here)
 
     assert len(run(name, arguments, quicker)) == rows
 
@@ -99,9 +104,22 @@ def test_the_benchmark_of_controllers_writes_a_table(run):
     assert importlib.import_module("benchmarks.controllers").table(rows).count("\n") == 3
 
 
+def test_the_least_time_of_a_point_mass_is_the_one_worked_by_hand_and_below_every_lap_that_was_flown():
+    least_time = importlib.import_module("benchmarks.lap_bound").least_time
+    ends, ball = torch.tensor([[0.0, 0, 0], [3, 0, 0]]).double(), 0.5 * torch.eye(3).double().repeat(2, 1, 1)
+    straight = least_time(ends, 0.0 * ball, is_closed=False, thrust=20.0, gravity=10.0)
+    assert straight == pytest.approx(math.sqrt(2 * 3 / math.sqrt(20**2 - 10**2)), rel=1e-5)
+    lap = least_time(ends, ball, is_round=True, thrust=20.0, gravity=0.0)  # 2 m there and back: full thrust both ways
+    assert lap == pytest.approx(4 * math.sqrt(2 / 20), rel=1e-5)
+    t = least_time(ends, 0.0 * ball, is_closed=False, thrust=20.0, gravity=0.0, drag=(2.0, 2.0, 0.0))
+    assert 20 / 2 * t - 20 / 2**2 * (1 - math.exp(-2 * t)) == pytest.approx(3.0, rel=1e-4)
+    assert all(float(row["least_ratio"]) > 1.0 for row in read_rows(BENCHMARKS / "results/racing.csv"))
+
+
 def test_the_results_that_are_published_name_their_machine():
     published = list((BENCHMARKS / "results").glob("*.csv"))
-    programs = {path.stem.removesuffix("_recipes") for path in BENCHMARKS.glob("*.py")} - {"laps", "report", "gpu"}
+    programs = {path.stem.removesuffix("_recipes") for path in BENCHMARKS.glob("*.py")}
+    programs -= {"laps", "lap_bound", "report", "gpu"}
     assert {path.stem for path in published} == programs | {"transfer"}
     for path in published:
         assert all(row["machine"] for row in read_rows(path))

@@ -238,7 +238,7 @@ def test_a_track_comes_from_a_file_and_starts_lie_half_way_by_default(tmp_path):
 
 
 @cases(
-    ("monza", "Unknown track 'monza'. Choose from: random, six_gates, visfly; or give the path"),
+    ("monza", "Unknown track 'monza'. Choose from: airsim, .*, split_s, time_optimal, visfly; or give the path"),
     ({"gates": [[0, 0, 1]]}, "track: a track has 2 to 1000 gates, got 1"),
     ({"gate": []}, "unknown key 'gate'. Allowed: gates, starts, gate_radius"),
     ({}, "gates must be a list of points"),

@@ -95,8 +95,8 @@ class RacingEnv(QuadrotorEnv):
     - ``scene``, obstacles, as for :class:`~torchrl_quad.envs.QuadrotorEnv`.
 
     Args:
-        track: "visfly", "six_gates", "random", the path of a file that :func:`~torchrl_quad.load_track` reads, or a
-            mapping, with 2 to 1000 gates. ``{"file": PATH, "width": 1.5, "height": 1.5}`` adds to a file.
+        track: "visfly", "six_gates", "time_optimal", "split_s", "alpha_pilot", "airsim", "lsy_level0", "random", the
+            path of a file, or a mapping, with 2 to 1000 gates. ``{"file": PATH, "width": 1.5}`` adds to a file.
         reward: which of the two rewards above.
         gate_bonus: how gates are paid, as above.
         observe_directions: whether the policy observes the directions of gates.

@@ -264,7 +264,9 @@ def check_order(
             {"quantity": signal.field, "order": _ORDERS[best]},
         )
     others = float(np.delete(worth[0], 0).max())
-    return f"the order of the motors fits how the drone turns: {worth[0, 0]:.2f} of 3, and {others:.2f} in another order"
+    return (
+        f"the order of the motors fits how the drone turns: {worth[0, 0]:.2f} of 3, and {others:.2f} in another order"
+    )
 
 
 def turning_fits(

@@ -12,9 +12,9 @@ ITERATIONS = 30
 log = read_log(Path(torchrl_quad.__file__).parents[1] / "examples/data/figure8.csv.gz")
 print(log)
 
-# A guess: little drag, which acts at the centre of mass, and the inertia of the bare drone.
+# A guess: little drag, which acts at the centre of mass, the inertia of the bare drone, and a thrust that rotors reach.
 guess = load_drone("crazyflie").replace(
-    inertia=[1.4e-5, 1.4e-5, 2.17e-5], linear_drag=[1e-3, 1e-3, 1e-3], drag_height=0.0
+    inertia=[1.4e-5, 1.4e-5, 2.17e-5], linear_drag=[1e-3, 1e-3, 1e-3], drag_height=0.0, max_thrust_to_weight=1.7
 )
 # Motion tells only ratios to the mass, so weigh the drone. What the flight does not tell keeps the value of the guess.
 wanted = ["thrust_map", "linear_drag", "drag_height", "inertia", "command_delay", "stream_delay"]

@@ -14,7 +14,15 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType
 from torchrl.objectives import SoftUpdate
 
-from torchrl_quad import HoveringEnv, LandingEnv, SHACLoss, differentiable_rollout, make_actor, make_value, restart
+from torchrl_quad import (
+    HoveringEnv,
+    LandingEnv,
+    SHACLoss,
+    differentiable_rollout,
+    make_actor,
+    make_value,
+    restart,
+)
 from torchrl_quad.envs import TASKS
 from torchrl_quad.envs.metrics import EPISODE_METRICS
 from torchrl_quad.files import read_rows
@@ -133,8 +141,8 @@ def judged(actor, seed=99, **options):
 
 
 def test_shac_learns_to_hover_in_seconds():
-    coarse = {"num_envs": 64, "control_dt": 0.05, "dt": 0.025, "max_episode_steps": 100}  # few steps a second of flight
-    iterations = 64
+    coarse = {"num_envs": 64, "control_dt": 0.05, "dt": 0.01, "max_episode_steps": 100}  # few steps a second of flight
+    iterations = 80
     env = HoveringEnv(seed=0, **coarse)
     actor = make_actor(env, input_scale=0.5)
     loss = SHACLoss(actor, make_value(env, input_scale=0.5))

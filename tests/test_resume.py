@@ -232,7 +232,7 @@ def test_ctrl_c_before_a_checkpoint_says_so_and_a_bug_keeps_its_traceback(
 
 def test_what_environment_and_loss_refuse_ends_in_one_line_and_leaves_no_folder(refused, launch, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert refused("bptt", *SMALL, "env.drone=hawk").startswith("Error: Unknown drone 'hawk'. Choose from: crazyflie")
+    assert refused("bptt", *SMALL, "env.drone=hawk").startswith("Error: Unknown drone 'hawk'. Choose from: cf2p")
     assert not list(tmp_path.glob("outputs/hovering/bptt/seed0/*"))
     assert "env.curve=oval: it must be one of slow_circle" in refused("bptt", *SMALL, "task=tracking", "env.curve=oval")
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")

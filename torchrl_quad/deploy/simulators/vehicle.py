@@ -150,8 +150,8 @@ class PIDLoop(ContractLoop):
 
     Its gains follow from the contract by a rule. P is the contract's gain times the inertia, and D the contract's
     damping, but of the measured body rate: with a perfect derivative the loop would be that of the contract in steps of
-    dt. The derivative passes a low-pass filter of first order at 100 Hz. I is P times a tenth of that loop's bandwidth;
-    the integral is held while a rotor saturates. Mixer and limits are those of the contract.
+    dt. The derivative passes a low-pass filter of first order at 100 Hz. I is P times a tenth of the bandwidth of that
+    loop in continuous time, held while a rotor saturates. Mixer and limits are those of the contract.
     """
 
     cutoff = 100.0  # [Hz], of the derivative
@@ -159,7 +159,7 @@ class PIDLoop(ContractLoop):
 
     def __init__(self, drone: Drone, dt: float) -> None:
         super().__init__(drone, dt)
-        self.integral_gain = self.gain * self.integral_share * drone.rate_loop(dt).bandwidth
+        self.integral_gain = self.gain * self.integral_share * drone.rate_loop(0.0).bandwidth
         self.smoothing = 1.0 - np.exp(-2.0 * np.pi * self.cutoff * dt)
         self.integral, self.derivative = np.zeros(3), np.zeros(3)
         self.before: Array | None = None

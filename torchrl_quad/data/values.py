@@ -168,7 +168,7 @@ def follow(transform: Any, followed: Followed) -> None:
         rewards |= {b: elementwise(transform, cast(Value, rewards[a])) for a, b in zip(ins, outs, strict=True)}
     elif isinstance(transform, COUNTERS):
         if isinstance(transform, StepCounter) and (twice := known.keys() & {*outs}):
-            raise NotImplementedError(f"{min(twice)!r} is written before, by another transform: count under another key")
+            raise NotImplementedError(f"{min(twice)!r} is written before, by another transform: use another key")
         known.update(dict.fromkeys(outs, followed.evolve(transform)))
         if getattr(transform, "max_steps", None) is not None:
             ours = (transform.truncated_key, transform.update_done) == ("truncated", True)

@@ -117,7 +117,7 @@ def _completed(source: str, kind: str, found: Found, fields: Mapping[str, Any]) 
     plain = {"rate_gain": [1.0] * 3, "rate_damping": [0.0] * 3, "max_thrust_to_weight": 1.5, "max_body_rate": [6.0] * 3}
     drone = read_drone(plain | {k: v for k, (v, _) in found.items()}, torch.float64, source)
     rotors = FlightController(drone)
-    most = ((rotors.middle + rotors.half_span) / (drone.mass * drone.gravity)).clamp(1.1, 5.0)
+    most = rotors.reach().clamp(1.1, 5.0)
     rates = rotors.spare_torque() / drone.inertia * torch.tensor([0.1, 0.1, 0.5])
     rates = rates.minimum(torch.tensor([6.0, 6.0, 2.0])).clamp_min(0.1)
     limits = {

@@ -80,7 +80,7 @@ def final_evaluation(
     """Fly a policy over fresh episodes, side by side, from starts drawn with the seed: a summary, and the flight."""
     env = build_env(cfg, episodes, seed, normalizer=normalizer)
     if cfg.compile and "depth" in observed(env):  # rays are five times slower without, which costs more than to compile
-        env = build_env(cfg, episodes, seed, normalizer=normalizer, compile=True)
+        task_of(env).compile()
     metrics, flight = evaluate(env, actor)
     summary = {"task": cfg.task, "algorithm": cfg.algorithm, "seed": cfg.seed, "episodes": episodes}
     return summary | {name.removeprefix("eval/"): v for name, v in metrics.items() if name.startswith("eval/")}, flight

@@ -1,5 +1,6 @@
 """Every recipe on a reduced budget, and training that is long enough to succeed."""
 
+import gc
 import json
 import math
 import re
@@ -41,6 +42,16 @@ def train(launch):
     return lambda recipe, folder, *overrides: launch(recipe, *SMALL, f"hydra.run.dir={folder}", *overrides)
 
 
+@pytest.fixture
+def no_garbage_of_others():
+    """What other tests leave takes most of a second to look through, which the clock of a run would count."""
+    gc.collect()
+    gc.freeze()
+    yield
+    gc.unfreeze()
+
+
+@pytest.mark.usefixtures("no_garbage_of_others")
 def test_a_compiled_run_learns_what_an_eager_one_does(train, no_pictures, tmp_path):
     small = ["env.integrator=euler", "hydra.job_logging.root.level=WARNING"]
     for mode in ("false", "true"):

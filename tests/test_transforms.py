@@ -184,6 +184,11 @@ def test_what_flies_in_torchrl_s_loop_says_why():
     assert reason(compile=False).reason.startswith("the environment is not compiled")
     assert reason(StepCounter(max_steps=5)) == ("inside", "")
     assert reason(RewardSum(), FrameSkipTransform(2)).reason.startswith("FrameSkipTransform is none of")
+    assert "'step_count' is written before" in reason(StepCounter(max_steps=3), StepCounter(max_steps=4)).reason
+    for drops in (ExcludeTransform("step_count"), RenameTransform(["step_count"], ["n"])):
+        assert reason(StepCounter(), drops).reason.startswith(
+            "'step_count' is counted in a step, and a later transform"
+        )
     env, flights = HoveringEnv(num_envs=2), []
     for flown in (env, TransformedEnv(env, FrameSkipTransform(3))):  # it flies no further, as docs/engine.md says
         env.set_seed(0)

@@ -360,6 +360,9 @@ def under_transforms(env: EnvBase, actor: TensorDictModuleBase) -> Flown | str:
             follow(transform, followed)
         except (NotImplementedError, KeyError, RuntimeError) as error:
             return f"{name}: {error}"
+    counted = (key for x in transforms if isinstance(x, COUNTERS) for key in written_by(x))
+    if lost := [key for key in counted if key not in known]:
+        return f"{lost[0]!r} is counted in a step, and a later transform drops it before the next: keep it there"
     reads = {}
     for key in map(unravel_key, actor.in_keys):
         if key in memory or (memory and key == "is_init") or key in map(unravel_key, actor.out_keys):

@@ -167,8 +167,8 @@ def follow(transform: Any, followed: Followed) -> None:
             raise NotImplementedError("a reset leaves what it writes as it was, which is followed for rewards alone")
         rewards |= {b: elementwise(transform, cast(Value, rewards[a])) for a, b in zip(ins, outs, strict=True)}
     elif isinstance(transform, COUNTERS):
-        if isinstance(transform, StepCounter) and (twice := known.keys() & {*outs}):
-            raise NotImplementedError(f"{min(twice)!r} is written before, by another transform: use another key")
+        if isinstance(transform, StepCounter) and (twice := [key for key in outs if key in known]):
+            raise NotImplementedError(f"{twice[0]!r} is written before, by another transform: use another key")
         known.update(dict.fromkeys(outs, followed.evolve(transform)))
         if getattr(transform, "max_steps", None) is not None:
             ours = (transform.truncated_key, transform.update_done) == ("truncated", True)

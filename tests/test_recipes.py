@@ -15,15 +15,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType
 from torchrl.objectives import SoftUpdate
 
-from torchrl_quad import (
-    HoveringEnv,
-    LandingEnv,
-    SHACLoss,
-    differentiable_rollout,
-    make_actor,
-    make_value,
-    restart,
-)
+from torchrl_quad import HoveringEnv, LandingEnv, SHACLoss, differentiable_rollout, make_actor, make_value, restart
 from torchrl_quad.envs import TASKS
 from torchrl_quad.envs.metrics import EPISODE_METRICS
 from torchrl_quad.files import read_rows

@@ -33,7 +33,9 @@ class _Build(type(EnvBase)):
                 "auto_reset=True is for environments that reset themselves in the step that ends an episode, and this "
                 "one waits for a reset. Leave it out: rollouts and collectors reset where an episode ends."
             )
-        return super().__call__(*args, **kwargs)
+        env = super().__call__(*args, **kwargs)
+        env._built_with = args, kwargs
+        return env
 
 
 @checked
@@ -245,6 +247,11 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         from torchrl_quad.render.video import draw_frame  # matplotlib is needed only here
 
         return draw_frame(self, drones, size)
+
+    def rebuilt(self, **changes: Any) -> Any:
+        """The same environment with other arguments, built again: ``env.rebuilt(num_envs=8, wind=None)``."""
+        args, kwargs = self._built_with
+        return type(self)(*args, **{**kwargs, "compile": self._stepper.options or self.is_compiled, **changes})
 
     def _place(self, drone: QuadrotorParams) -> None:
         """Build what holds tensors on the device and in the precision of the environment."""

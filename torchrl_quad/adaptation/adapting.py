@@ -101,7 +101,8 @@ class Adapter:
             raise UserTypeError(
                 f"Adapter: env must be a QuadrotorEnv, such as HoveringEnv(), not {type(env).__name__}."
             )
-        if not (isinstance(policy, nn.Module) and hasattr(policy, "get_dist_params") and [*policy.parameters()]):
+        learns = isinstance(policy, nn.Module) and hasattr(policy, "get_dist_params")
+        if not learns:
             raise UserTypeError(
                 f"Adapter: {type(policy).__name__} is no policy that can learn. Give one that make_actor has built."
             )
@@ -120,7 +121,8 @@ class Adapter:
                 "rotor speed of 4000 rad/s, MotorCommand(4000.0, 1.0)."
             )
         prediction.log_columns(base.params)
-        self.policy, self.flown = copy.deepcopy(policy), Flown(base.params)
+        self.policy: Any = copy.deepcopy(policy)
+        self.flown = Flown(base.params)
         self.max_kl, self.steps, self.horizon, self.lr, self.seed = max_kl, steps, horizon, lr, seed
         kept = [x for x in base._options["disturbances"]]
         inner = base.rebuilt(num_envs=num_envs, seed=seed, randomize=None, wind=None, disturbances=[*kept, self.flown])
@@ -170,7 +172,7 @@ class Adapter:
         optimizer = torch.optim.Adam(actor.parameters(), self.lr, betas=(0.7, 0.95))
         schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.1, self.steps)
         reference = self._fly(old, self.seed)
-        best, best_score, reference = old, _score(reference), reference[:, ::_EVERY]
+        best, best_score, reference = old, _score(reference), cast(TensorDictBase, reference[:, ::_EVERY])
         for step in range(1, self.steps + 1):
             rollout, end = self._horizon(actor, carry)
             optimizer.zero_grad()

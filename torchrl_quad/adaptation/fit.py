@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -162,7 +163,7 @@ def _solve(errors: Callable[[Tensor], Tensor], free: list[int], train: Tensor) -
     scale = _LEAST
     if not free:
         return x, cover, scale
-    penalty = torch.diag(_PRIOR[free] ** -2)
+    penalty = normal = torch.diag(_PRIOR[free] ** -2)
     for _ in range(_STEPS):
         e = errors(x)[train]
         slope = torch.func.jacfwd(errors)(x)[train][..., free]
@@ -181,17 +182,20 @@ def simulated_log(rollout: TensorDictBase, env: QuadrotorEnv, drone: int = 0) ->
     1.0)`` say what its commands mean: those that make its rotors turn as they did, steady over a control step."""
     params, over = env.params, leaf(rollout, ("next", "done"))[drone, :, 0]
     steps = int(over.int().argmax()) + 1 if over.any() else len(over)
-    state = {name: leaf(rollout, ("state", name))[drone, :steps].double().cpu().numpy() for name in env.dynamics.sizes}
+    state: dict[str, Any] = {
+        name: leaf(rollout, ("state", name))[drone, :steps].double().cpu().numpy() for name in env.dynamics.sizes
+    }
     motors = params.motor_command or MotorCommand(float(params.rotor_speed_max.max()), 1.0)
     speed = state.pop("rotor_speed")
     change = np.diff(speed, axis=0, append=speed[-1:])
     up, down = params.motor_time_constant.double().expand(2).tolist()
     wanted = speed + change / -np.expm1(-env.control_dt / np.where(change > 0.0, up, down))
     command = (wanted - motors.speed_at_zero) / (motors.speed_per_volt * motors.nominal_voltage)
-    time, none = env.control_dt * np.arange(steps), dict.fromkeys(("acceleration", "battery_voltage", "setpoint"))
+    time: Any = env.control_dt * np.arange(steps)
     command = np.stack([np.interp(time + motors.delay, time, x) for x in command.T], 1).clip(0.0, 1.0)
-    about = {"segments": ((0, steps),), "onboard": (), "notes": ("simulated",)}
-    return FlightLog("simulated", time=time, motor_command=command[:, _of_rotors(params)], **state, **none, **about)
+    state |= {"time": time, "motor_command": command[:, _of_rotors(params)], "segments": ((0, steps),)}
+    state |= {"acceleration": None, "battery_voltage": None, "setpoint": None}
+    return FlightLog("simulated", **state, onboard=(), notes=("simulated",))
 
 
 def _of_rotors(params: QuadrotorParams) -> list[int]:

@@ -87,9 +87,9 @@ def _compared(found: Adaptation) -> Any:
     figure = make_figure(figsize=(7.2, 2.6), layout="constrained")
     ax = figure.subplots()
     for flight, color, label in zip(found.flights, (RED, BLUE), ("before", "after"), strict=True):
-        measured = flight["next", "metrics"] if ("next", "metrics") in flight.keys(True) else {}
-        name = next(iter(measured.keys()), "reward")
-        values = (measured[name] if name != "reward" else flight["next", "reward"]).squeeze(-1).float().numpy()
+        measured: Any = flight.get(("next", "metrics"), {"reward": flight.get(("next", "reward"))})
+        name = next(iter(measured.keys()))
+        values: Any = measured[name].squeeze(-1).float().numpy()
         low, middle, high = np.nanquantile(values, (0.05, 0.5, 0.95), axis=0)
         time = np.arange(1, len(middle) + 1) * found.control_dt
         ax.fill_between(time, low, high, color=color, alpha=0.2, linewidth=0)

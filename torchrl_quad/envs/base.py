@@ -90,6 +90,7 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
     """
 
     batch_locked, _supports_set_state = True, True
+    _built_with: Any  # all arguments
 
     def __init__(
         self,

@@ -6,7 +6,7 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_quad import HoveringEnv, SHACLoss, differentiable_rollout, make_actor, make_value, restart
 
-ITERATIONS = 600
+ITERATIONS = 300
 ANY = {
     "drone": "cf2x",  # the order of its rotors; nothing else of it
     "randomize": "any",  # mass, size, thrust, lag and delay are drawn for each episode

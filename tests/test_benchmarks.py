@@ -64,7 +64,7 @@ def test_a_benchmark_writes_a_table(name, arguments, rows, run, run_here, tmp_pa
         if hasattr(module, "identify"):
             quick = functools.partial(module.identify, fields=["linear_drag"], iterations=1, draws=2)
             monkeypatch.setattr(module, "identify", quick)
-        monkeypatch.setattr(module, "STEPS", 5, raising=False)
+        monkeypatch.setattr(module, "STEPS", 40, raising=False)
         if name in ("racing", "any_drone"):
             monkeypatch.setattr(module, "run", run_here)
 

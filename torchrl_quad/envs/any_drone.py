@@ -58,9 +58,11 @@ class AnyDrone(DroneRandomization):
     ``delay``             0, 3              control steps from a command to its effect; instead of ``action_delay``
     ====================  ================  ==========================================================================
 
-    Torque per inertia, which these give, spans 14 to 6000 rad/s2; RAPTOR draws 40 to 1200. ``randomize={"any":
-    {"thrust_to_weight": [2, 4]}}`` changes ranges. Layout, order and spin of the four rotors, the range of their speeds
-    and the shape of the thrust curve are those of ``drone``; all else of it is replaced by the middle of the ranges.
+    ``thrust_to_weight``, ``arm``, ``inertia``, ``inertia_ratio`` and ``yaw_torque`` are even in their logarithms, the
+    others in their values. Torque per inertia, which these give, spans 14 to 6000 rad/s2; RAPTOR draws 40 to 1200.
+    ``randomize={"any": {"thrust_to_weight": [2, 4]}}`` changes ranges. Layout, order and spin of the four rotors, the
+    range of their speeds and the shape of the thrust curve are those of ``drone``; all else of it is replaced by the
+    middle of the ranges.
 
     It needs ``control="rotor_thrusts"``, whose action -1..1 is then the motor signal: 0..1 of the greatest thrust of
     the drawn drone's own rotors, so that a policy need not know which drone it flies.
@@ -89,11 +91,13 @@ class AnyDrone(DroneRandomization):
         self.full, places = thrust_limits(layout)[1], layout.rotor_positions[:, :2]
         self.rotors, self.directions = Rotors(layout), places / places.norm(dim=-1).mean()
         self.slowest, self.gravity, self.thrust_map = layout.rotor_speed_min, layout.gravity, layout.thrust_map
-        # What the controller scales actions by: the middle of the ranges.
-        _, fields = self._drone(layout.mass.new_zeros(1, len(RANGES)))
-        weights = {"max_thrust_to_weight": self._value("thrust_to_weight", layout.mass.new_zeros(1))}
-        usual = {"drag_height": 0.0, "quadratic_drag": [0.0] * 3}
-        self.middle = layout.replace(**{k: x[0] for k, x in fields.items()}, **weights, **usual)
+        for share in (-1.0, 1.0, 0.0):
+            drawn, fields = self._drone(layout.mass.new_full((1, len(RANGES)), share))
+            changes = {"drag_height": 0.0, "quadratic_drag": [0.0] * 3, **{k: x[0] for k, x in fields.items()}}
+            try:  # at last the middle, by which the controller scales actions
+                self.middle = layout.replace(**changes, max_thrust_to_weight=drawn["thrust_to_weight"][0])
+            except ValueError as error:
+                raise UserValueError(f"{source}: the drones that any may draw are not all possible: {error}") from error
 
     def start(self, random: Randomness, state: State) -> State:
         drawn, fields = self._drone(random.uniform(n := len(state["position"]), len(RANGES)))

@@ -1,3 +1,4 @@
+import gc
 import os
 import runpy
 import sys
@@ -24,6 +25,13 @@ LONG = {"test_docs.py", "test_transforms.py", "test_horizon.py", "test_processes
 def pytest_collection_modifyitems(items):
     """The longest tests start first, so that no worker is left alone with one at the end."""
     items.sort(key=lambda item: item.path.name not in LONG)
+
+
+def pytest_collection_finish():
+    """What has been imported, most of a million objects, need not be looked through again: a tenth of the time."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(10_000, 10, 10)
 
 
 @pytest.fixture(autouse=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -34,7 +35,9 @@ class _Build(type(EnvBase)):
                 "auto_reset=True is for environments that reset themselves in the step that ends an episode, and this "
                 "one waits for a reset. Leave it out: rollouts and collectors reset where an episode ends."
             )
-        return super().__call__(*args, **kwargs)
+        env = super().__call__(*args, **kwargs)
+        env._built_with = dict(zip(list(inspect.signature(cls).parameters), args, strict=False)) | kwargs
+        return env
 
 
 @checked
@@ -91,6 +94,7 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
     """
 
     batch_locked, _supports_set_state = True, True
+    _built_with: dict[str, Any]  # its arguments, by name
 
     def __init__(
         self,
@@ -251,6 +255,11 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         from torchrl_quad.render.video import draw_frame  # matplotlib is needed only here
 
         return draw_frame(self, drones, size)
+
+    def rebuilt(self, **changes: Any) -> Any:
+        """The same environment with other arguments, built again: ``env.rebuilt(num_envs=8, wind=None)``."""
+        given: dict[str, Any] = {**self._built_with, "compile": self._stepper.options or self.is_compiled, **changes}
+        return type(self)(**given)
 
     def _place(self, drone: QuadrotorParams) -> None:
         """Build what holds tensors on the device and in the precision of the environment."""

@@ -127,10 +127,14 @@ SETTINGS: dict[str, tuple[Any, str]] = {
     "known": (dict[str, Any] | None, "Fields of the drone that are known by measurement."),
     "fields": (list[str] | None, "What to fit; null for everything."),
     "past": (NonNegative, ""),
+    "motor_command": (dict[str, float] | None, "From motor commands to rotor speeds, as in a drone's file."),
+    "max_kl": (Positive, "How far the policy may move, as a KL divergence from the one that flew."),
+    "steps": (Size, "Gradient steps of the policy."),
     "iterations": (Size, ""),
     "draws": (Count, "Of the bootstrap over windows; 0 for none."),
 }
-PROGRAMS = {"logs": "identify", "folder": "export", "checkpoint": "evaluate"}  # by a setting that only they have
+# By a setting that only they have, and those above them.
+PROGRAMS = {"motor_command": "adapt", "logs": "identify", "folder": "export", "checkpoint": "evaluate"}
 IDENTIFYING = {"horizon": (Positive, ""), "folder": (str, "The folder to write.")}  # of identify.py, under these names
 #: The options of TorchRL's ClipPPOLoss that the recipe takes.
 PPO: dict[str, tuple[Any, str]] = {

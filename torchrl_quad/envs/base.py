@@ -17,6 +17,7 @@ from torchrl_quad.dynamics.rigid_body import Integrator
 from torchrl_quad.engine import Stepper, can_fly, flies_inside, fly, has_compiler, nested
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs import config, guard
+from torchrl_quad.envs.any_drone import AnyDrone
 from torchrl_quad.envs.markers import merge_reset, visible_state
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenes import MountedCamera
@@ -74,7 +75,9 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         weights: other weights of reward terms, by name, each within a million: ``{"velocity": 0.0}``.
         event_discount: the discount per control step by which the time of an event counts, above 0, at most 1; None
             for no gradient in it.
-        randomize: draws a drone for each episode; see :class:`~torchrl_quad.envs.disturbances.DroneRandomization`.
+        randomize: draws a drone for each episode, about this one, as
+            :class:`~torchrl_quad.envs.disturbances.DroneRandomization` says; or "any" of all quadrotors, as
+            :class:`~torchrl_quad.envs.any_drone.AnyDrone` says.
         wind: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.Wind`, or an instance.
         random_start: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.RandomStart`, or an instance.
         disturbances: your own, a list; see :class:`~torchrl_quad.envs.disturbances.Disturbance`. Each is an instance, a
@@ -119,8 +122,6 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         scene: config.SceneOption = None,
         camera: config.CameraOption = None,
     ) -> None:
-        if action_delay == 0 and observe_last_action:
-            raise UserValueError("observe_last_action shows commands on their way; with action_delay=0 there are none.")
         # What is built of these is built again on another device.
         self._options: dict[str, Any] = {
             "dynamics": dynamics, "control": control, "dt": dt, "control_dt": control_dt, "integrator": integrator,
@@ -138,6 +139,11 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         config.check_params(params, num_envs)
         self.weights = config.known_weights(self.weights, weights or {})
         self._place(params)
+        drawn = self.disturbances.get("randomize")
+        if isinstance(drawn, AnyDrone):
+            self.action_delay = drawn.queue_length(action_delay)
+        if self.action_delay == 0 and observe_last_action:
+            raise UserValueError("observe_last_action shows commands on their way; with action_delay=0 there are none.")
         self._params = params if params.requires_grad or params.rotor_effectiveness is not None else self.nominal
         self.randomness.seed(seed)
         self.set_up()

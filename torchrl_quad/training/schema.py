@@ -94,6 +94,11 @@ SETTINGS: dict[str, tuple[Any, str]] = {
     "actor.channels": (_Channels, "Of the convolutions of a visual policy: [8, 16]."),
     "actor.max_kl": (Positive | None, "How far an update, or PPO's iteration, may move the policy; null for none."),
     "actor.average": (Share | None, "The share of the iterations whose weights are averaged, as 0.1; null for none."),
+    "critic.in_keys": (
+        Annotated[list[str | list[str]], Field(min_length=1)] | None,
+        "The entries that the critic reads, such as [observation, [state, rotor_speed]].",
+    ),
+    "critic.input_scale": (Positive | list[Positive], "What it reads is multiplied by this, or by one for each entry."),
     "critic.lmbda": (Fraction, "The lambda of the TD(lambda) targets; 0.95 is usual."),
     "critic.updates": (Annotated[int, Field(ge=1, le=100_000)], "Gradient steps of the critic per iteration."),
     "critic.batch_size": (Size, "Control steps in a minibatch of the critic."),

@@ -20,6 +20,7 @@ from torchrl_quad.errors import MissingPackage, UserError, UserValueError, one_l
 VERSION = 5  # of the contract; raise it when a reader of the older one would misunderstand the new one
 GRAPHS = ("policy", "observe", "advance", "judge", "episode")  # the ONNX files that a bundle may have
 OTHERS = ("README.md", "policy.c", "policy.h", "starts.npz", "vectors.npz")  # files beside these and contract.json
+AUTOPILOTS = ("betaflight.txt", "px4.params", "crazyflie.txt")  # and these, where they exist
 MEASURED = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3}  # what each state must have
 ENDS = ("crash", "success", "terminated", "truncated")  # how a state ends an episode
 Contract = Mapping[str, Any]  # the content of contract.json, or a part of it
@@ -160,7 +161,8 @@ def _misfits(value: Any, part: str | None = None, at: str = "") -> Iterator[str]
 
 def files(contract: Contract) -> tuple[str, ...]:
     """The names of all files of a bundle but contract.json."""
-    return (*OTHERS, *(f"{name}.onnx" for name in GRAPHS if name in contract["graphs"]))
+    optional = (name for name in AUTOPILOTS if name in contract["sha256"])
+    return (*OTHERS, *optional, *(f"{name}.onnx" for name in GRAPHS if name in contract["graphs"]))
 
 
 def _contradictions(drone: Contract, name: str, hovers: bool = False) -> Iterator[str]:

@@ -24,6 +24,7 @@ from torchrl.modules import set_recurrent_mode
 from torchrl_quad.data import ObservationNormalizer, base_env, differentiable_rollout
 from torchrl_quad.data.transforms import normalized
 from torchrl_quad.data.unwrap import leaf, memory_keys, observed
+from torchrl_quad.deploy import autopilots
 from torchrl_quad.deploy import contract as contracts
 from torchrl_quad.deploy.bundle import load_bundle
 from torchrl_quad.deploy.contract import MEASURED
@@ -128,6 +129,7 @@ def export_policy(
     files |= {"vectors.npz": _npz(vectors), "starts.npz": _npz(starts)}
     files["README.md"] = write_page(contract, type(task).__doc__)
     files |= write_c(network, contract, {name: x[:: count // self_test] for name, x in vectors.items()})
+    files |= {name: text.encode() for name, text in autopilots.files(contract).items()}
     contract["sha256"] = {name: contracts.sha256(content) for name, content in files.items()}
     contract["digest"] = contracts.digest(contract)
     if problem := contracts.problem(contract):
@@ -299,7 +301,7 @@ def check_bundle_only(folder: Path) -> None:
     found = [*folder.iterdir()] if folder.is_dir() else []
     if found and not (folder / "contract.json").is_file():
         raise FileExistsError(f"{folder} exists and is no bundle. Choose another folder, or empty this one.")
-    own = {"contract.json", *contracts.OTHERS, *(f"{name}.onnx" for name in contracts.GRAPHS)}
+    own = {"contract.json", *contracts.OTHERS, *contracts.AUTOPILOTS, *(f"{name}.onnx" for name in contracts.GRAPHS)}
     if others := sorted(x.name for x in found if x.name not in own or not x.is_file() or x.is_symlink()):
         raise FileExistsError(
             f"{folder} also holds {', '.join(others)}: an export replaces the folder, and would delete that. Move it "

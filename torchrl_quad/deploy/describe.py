@@ -228,6 +228,8 @@ def _rate_loop(env: QuadrotorEnv, drone: Contract) -> Fields | None:
         "one would leave its limits, in this order: roll and pitch torque shrink by one factor, if they need more than "
         "the whole range; collective thrust moves by as little as makes room for them; yaw torque shrinks to what fits"
     )
+    if type(getattr(env.dynamics, "controller", None)) not in CONTROLS.values():
+        torque = inspect.cleandoc(type(env.dynamics).__doc__ or "")[:2000]
     return {"law": law, "torque": torque, "gain": drone["rate_gain"], **values}
 
 
@@ -250,8 +252,9 @@ GAINS = ("tilt_gain", "velocity_gain", "max_climb", "max_tilt")  # of the contro
 def _commands(env: QuadrotorEnv) -> Fields:
     """What the entries of an action command, and the law that follows a command."""
     controller = getattr(env.dynamics, "controller", None) or make_controller("rates", env.nominal)
-    mode = next((name for name, cls in CONTROLS.items() if type(controller) is cls), type(controller).__name__)
-    if mode not in LAWS:
+    names = (name for name, cls in reversed(CONTROLS.items()) if isinstance(controller, cls))  # rates, their base, last
+    mode = next(names, type(controller).__name__)
+    if mode not in LAWS or (mode == "rates" and controller.action_units != CONTROLS[mode].action_units):
         raise UserValueError(f"export_policy exports the controls {', '.join(LAWS)}; got {mode!r}.")
     one = torch.ones_like(controller.hover_action)
     low, high = (numbers(_single("the range of actions", controller.decode(x).float(), 1)) for x in (-one, one))

@@ -84,13 +84,16 @@ class _Methods:
     """
 
     def __init__(self, env: QuadrotorEnv, state: State) -> None:
-        self.env, self.unjudged = env, None
+        self.env = env
+        self.unjudged: str | None = None
         self.changing = [*MEASURED, *(["action_queue"] if "action_queue" in state else [])]
         self.known = {name_of(key): key for key in (*self.changing, *env.task_entries, "step")}
         self.hidden = {f"hidden.{name_of(key)}": key for key in state if key not in self.known.values()}
         self.inputs = {name: state[key] for name, key in (self.known | self.hidden).items()}
         self.inputs |= {f"previous.{name}": state[name].clone() for name in self.changing}
-        self.obstacles = {name_of(key): key for key in state if isinstance(key, tuple) and key[0] == "scene"}
+        self.obstacles: dict[str, Key] = {
+            name_of(key): key for key in state if isinstance(key, tuple) and key[0] == "scene"
+        }
         self.inputs |= {name: state[key].clone() for name, key in self.obstacles.items()}
         self.methods: list[Method] = [self.observe, self.advance, self.judge, self.measure, self.sum_up]
         self.flight: dict[str, tuple[str, ...]] = {}

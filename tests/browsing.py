@@ -21,6 +21,7 @@ def browser():
     from playwright.sync_api import sync_playwright
 
     webgl_on_the_cpu = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    webgl_on_the_cpu += ["--disable-gpu-rasterization", "--disable-gpu-compositing"]  # which draws the rest there quicker
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", *webgl_on_the_cpu])
         yield browser

@@ -385,8 +385,9 @@ class Bonus(HoveringEnv):
 
 
 def test_a_compiled_step_sees_changed_attributes_classes_and_globals(monkeypatch):
-    # What is watched does not depend on the backend, and this one generates no code.
-    eager, compiled = Bonus(num_envs=2), Bonus(num_envs=2).compile(backend="eager")
+    # What is watched does not depend on the drone and on the backend, and this one generates no code.
+    eager, compiled = (Bonus(num_envs=2, dynamics="point_mass") for _ in range(2))
+    compiled.compile(backend="eager")
 
     def step(env):
         td = env.reset().set("action", env.hover_action.repeat(2, 1))

@@ -53,7 +53,7 @@ def no_garbage_of_others():
 
 @pytest.mark.usefixtures("no_garbage_of_others")
 def test_a_compiled_run_learns_what_an_eager_one_does(train, no_pictures, tmp_path):
-    small = ["env.integrator=euler", "hydra.job_logging.root.level=WARNING"]
+    small = ["env.dynamics=point_mass", "hydra.job_logging.root.level=WARNING"]
     for mode in ("false", "true"):
         train("bptt", tmp_path / mode, *small, f"compile={mode}")
     eager, compiled = (read_rows(tmp_path / mode / "metrics.csv") for mode in ("false", "true"))

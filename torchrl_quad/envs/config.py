@@ -14,6 +14,7 @@ from pydantic import AfterValidator
 
 from torchrl_quad.dynamics import DYNAMICS, Dynamics, QuadrotorParams
 from torchrl_quad.dynamics.gains import MAX_SUBSTEPS
+from torchrl_quad.envs.any_drone import any_drone
 from torchrl_quad.envs.disturbances import Disturbance, DroneRandomization, RandomStart, Sensors, Wind
 from torchrl_quad.envs.scenes import MountedCamera, Scene
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
@@ -66,7 +67,7 @@ WindOption = Annotated[Any, buildable(Wind, "wind")]
 StartOption = Annotated[Any, buildable(RandomStart, "random_start")]
 RandomizeOption = Annotated[
     Any,
-    accepted(lambda x: isinstance(x, str | Path | Mapping | None) and x != "", "a mapping, or the path of a YAML file"),
+    accepted(lambda x: isinstance(x, str | Path | Mapping | None) and x != "", "any, a mapping, or the path of a file"),
 ]
 DisturbancesOption = Annotated[Any, AfterValidator(lambda value: as_disturbances(value) and value)]
 SceneOption = Annotated[Any, AfterValidator(_scene)]
@@ -117,6 +118,13 @@ def build_dynamics(nominal: QuadrotorParams, options: Mapping[str, Any]) -> Dyna
             f"{dt}. Try control_dt={min(max(substeps, 1), MAX_SUBSTEPS) * dt:g}."
         )
     more = {"control": control} if takes_control else {}
+    if drawn := any_drone(options["randomize"], nominal):
+        if control != "rotor_thrusts":
+            raise UserValueError(
+                f"randomize='any' draws the whole drone, of which no flight controller knows; got "
+                f"control={shown(control)}. Write control='rotor_thrusts'."
+            )
+        nominal = drawn.middle
     return model(nominal, dt=dt, substeps=substeps, integrator=options["integrator"], **more)
 
 
@@ -129,7 +137,8 @@ def build_disturbances(
         chosen["random_start"] = build(RandomStart, "random_start", options["random_start"])
     if options["randomize"]:
         worn = dynamics.nominal.replace(rotor_effectiveness=drone.rotor_effectiveness)
-        drawn = DroneRandomization(options["randomize"], worn, dynamics.plant_fields)
+        drawn = any_drone(options["randomize"], drone)
+        drawn = drawn or DroneRandomization(options["randomize"], worn, dynamics.plant_fields)
         chosen["randomize"] = drawn
         for params in drawn.liveliest(dynamics.nominal):
             check_flown(dynamics, params, "randomize: a ")

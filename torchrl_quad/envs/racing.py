@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.engine.packing import Key
@@ -28,6 +29,7 @@ RELAXATION_WEIGHTS = {"log": {"gate": 5.0}, "reciprocal": {"gate": 1.0}}
 GATES, ROTATIONS = ("track", "gates"), ("track", "rotations")  # in the state, where each episode has another track
 FirstGate = Annotated[int, between(0, 999)]
 START_ROOM = 0.05  # [m], to the sides of the box, at least
+RETURN = 2.0  # [m], before a gate, where drones are led that are beyond it
 SAMPLES = 8  # of the way of a step, on which it may touch the frame of a gate
 
 
@@ -158,16 +160,19 @@ class RacingEnv(QuadrotorEnv):
         self.gates, self.starts = self.tensor(gates), self.tensor(track["starts"])
         self.gate_indices = torch.arange(len(self.gates), device=self.device)
         self.course = Course(**track["random"]) if "random" in track else None
-        self.moved, self.turned = (track.get(f"{name}_jitter", (0.0,) * 3) for name in ("position", "rotation"))
-        self.is_drawn = self.course is not None or any((*self.moved, *self.turned))
+        self.moved, self.turned = (self.tensor(track.get(f"{x}_jitter", (0.0,) * 3)) for x in ("position", "rotation"))
+        self.is_drawn = self.course is not None or bool(self.moved.any() or self.turned.any())
         self.drone_radius, self.floor = reach_of(self.nominal), track.get("floor", 0.0)
         low, high = self.gates.amin(0), self.gates.amax(0)
         if self.course is not None:
             reach, heights = self.course.reach, self.course.heights
-            low, high = self.tensor([-reach, -reach, min(heights)]), self.tensor([reach, reach, max(heights)])
-        moved = self.tensor(self.moved)
-        low, high = low - moved, high + moved
-        places = [(f"gates stand from {_metres(low)} to {_metres(high)}", low, high)]
+            low, high = self.tensor([[-reach, -reach, min(heights)], [reach, reach, max(heights)]])
+        low, high = low - self.moved, high + self.moved
+        places = {f"gates stand from {_metres(low)} to {_metres(high)}": (low, high)}
+        if self.course is None:  # else starts are put inside the box
+            room = self.moved + self.start_range  # starts move with their gates
+            for start, point in zip(self.starts, track["starts"], strict=True):
+                places[f"drones start within {self.start_range} m of {point}"] = (start - room, start + room)
         self.half_width = 0.5 * (high - low)[:2] + self.box_margin
         self.ceiling = max(self.box_height, high[2].item() + self.box_margin)
         if "box" in track:
@@ -176,11 +181,7 @@ class RacingEnv(QuadrotorEnv):
         self.centre = 0.5 * (low + high)
         self.centre[2] = 0.5 * (self.floor + self.ceiling)
         self.half_box = torch.cat((self.half_width, self.centre[2:] - self.floor))
-        if self.course is None:  # else starts are put inside the box
-            room = moved + self.start_range  # starts move with their gates
-            for start, point in zip(self.starts, track["starts"], strict=True):
-                places.append((f"drones start within {self.start_range} m of {point}", start - room, start + room))
-        for what, *corners in places:
+        for what, corners in places.items():
             if self.is_crash({"position": torch.stack(corners)}).any():
                 low, high = (_metres(self.centre + sign * self.half_box) for sign in (-1.0, 1.0))
                 raise UserValueError(
@@ -193,23 +194,22 @@ class RacingEnv(QuadrotorEnv):
         if self.first_gate is not None:
             gate = torch.full_like(gate, self.first_gate)
         state = self.draw_track(n)
-        starts = self.starts[gate[:, 0]]
-        if any(self.moved):
-            starts = starts + self.pose(state, gate)[0] - self.gates[gate[:, 0]]
+        target, starts = self.pose(state, gate)[0], self.starts[gate[:, 0]]
+        if "position_jitter" in self.track:
+            starts = starts + target - self.gates[gate[:, 0]]
         if self.course is not None:
             every = starts_before(state[GATES], state.get(ROTATIONS), self.floor)
             room = (self.half_box - self.start_range - START_ROOM).clamp_min(0.0)
-            starts = self.centre + torch.clamp(
-                every[torch.arange(n, device=self.device), gate[:, 0]] - self.centre, -room, room
-            )
-        start = self.hover_state(starts + self.start_range * self.uniform(n, 3))
+            own = every[torch.arange(n, device=self.device), gate[:, 0]]
+            starts = self.centre + torch.clamp(own - self.centre, -room, room)
+        start, no = self.hover_state(starts + self.start_range * self.uniform(n, 3)), torch.zeros_like(gate).bool()
         return {
             **start,
             **state,
-            **({"frame_touched": torch.zeros_like(gate, dtype=torch.bool)} if self.frame else {}),
+            **({"frame_touched": no} if self.frame else {}),
             "gate": gate,
-            "target": self.pose(state, gate)[0],
-            "gate_passed": torch.zeros_like(gate, dtype=torch.bool),
+            "target": target,
+            "gate_passed": no.clone(),
             "gates_passed": torch.zeros_like(gate),
             "pass_step": torch.full_like(gate, -1).repeat(1, len(self.gates)),
             "lap_time": torch.zeros_like(start["position"][:, :1]),
@@ -219,22 +219,28 @@ class RacingEnv(QuadrotorEnv):
         """What stands in the state of n episodes, each with a track of its own; nothing where all share one."""
         if not self.is_drawn:
             return {}
-        gates, rotations = self.gates.expand(n, -1, -1), self.rotations.unsqueeze(0)
+        gates, rotations = (x.expand(n, *x.shape[1:]) for x in self.poses({}))
         if self.course is not None:
             gates, rotations = self.course.draw(n, self.uniform)
-        gates = gates + self.tensor(self.moved) * self.uniform(*gates.shape)
+        gates = gates + self.moved * self.uniform(*gates.shape)
         if not self.is_directed:
             return {GATES: gates}
-        turn = quaternion.from_axis_angle(self.tensor(self.turned) * self.uniform(*gates.shape))
-        return {GATES: gates, ROTATIONS: quaternion.multiply(rotations.expand(n, -1, -1), turn)}
+        turn = quaternion.from_axis_angle(self.turned * self.uniform(*gates.shape))
+        return {GATES: gates, ROTATIONS: quaternion.multiply(rotations, turn)}
+
+    def poses(self, state: State) -> tuple[Tensor, Tensor]:
+        """Centres (n, k, 3) [m] and rotations (n, k, 4) of all gates; n is 1 where all episodes share a track."""
+        return state.get(GATES, self.gates.unsqueeze(0)), state.get(ROTATIONS, self.rotations.unsqueeze(0))
 
     def pose(self, state: State, gate: Tensor) -> tuple[Tensor, Tensor]:
         """Centres (n, 3) [m] and, where gates have a direction, rotations (n, 4) of gates by their index (n, 1)."""
-        if not self.is_drawn:
-            return self.gates[gate[:, 0]], self.rotations[gate[:, 0]] if self.is_directed else self.rotations
-        chosen = (gate == self.gate_indices).unsqueeze(-1)  # by weights: bundles know no gather along shapes
-        found = [(x * chosen).sum(1) for x in (state[GATES], state[ROTATIONS] if self.is_directed else state[GATES])]
-        return found[0], found[1]
+        own = self.poses(state) if self.is_directed else self.poses(state)[:1]
+        if self.is_drawn:
+            chosen = (gate == self.gate_indices).unsqueeze(-1)  # by weights: bundles know no gather along shapes
+            found = [(x * chosen).sum(1) for x in own]
+        else:
+            found = [x[0, gate[:, 0]] for x in own]
+        return found[0], found[-1]
 
     def local(self, previous: State, state: State) -> tuple[Tensor, Tensor]:
         """Both ends of a step, each (n, 3) [m], in the frame of the gate that was next: x in its direction."""
@@ -256,9 +262,7 @@ class RacingEnv(QuadrotorEnv):
 
         The distance of the drone to them is taken at nine instants, and where it crosses the gate's plane.
         """
-        gates, rotations = (
-            (state[GATES], state[ROTATIONS]) if self.is_drawn else (self.gates[None], self.rotations[None])
-        )
+        gates, rotations = self.poses(state)
         start, end = (quaternion.rotate_inverse(rotations, x["position"][:, None] - gates) for x in (previous, state))
         way = end - start
         share = torch.arange(SAMPLES + 1, device=self.device, dtype=self.dtype) / SAMPLES
@@ -326,7 +330,23 @@ class RacingEnv(QuadrotorEnv):
         directions = 6 * (10.0,) if self.observe_directions else ()
         return self.tensor((*2 * (width, depth, self.ceiling - self.floor), *directions, *terms.BODY_BOUNDS))
 
+    def aim(self, state: State) -> Tensor:
+        """What the reward leads to, (n, 3) [m]: the next gate, or a point before it for a drone that is beyond it.
+
+        At the gate itself no way on would be rewarded to a drone that has missed it.
+        """
+        if not self.is_directed:
+            return state["target"]
+        ahead = forward(self.pose(state, state["gate"])[1])
+        beyond, speed = (
+            (x * ahead).sum(-1, keepdim=True) for x in (state["position"] - state["target"], state["velocity"])
+        )
+        # Who has crossed the plane in this step is about to pass the gate; the step's terms before that ask, too.
+        is_beyond = beyond > 2.0 * self.control_dt * speed.clamp_min(0.0)
+        return torch.where(is_beyond, state["target"] - RETURN * ahead, state["target"])
+
     def reward_terms(self, state: State) -> State:
+        state = {**state, "target": self.aim(state)}
         gap = terms.distance(state)
         if self.reward == "position":
             rewards = terms.target_reward(state, self.weights)
@@ -372,16 +392,12 @@ class RacingEnv(QuadrotorEnv):
     def markers_of(self, drawn: State) -> Markers:
         """The gates of the episode in one environment, or of the track that all share."""
         success = self.success_gates if self.is_closed else len(self.gates)
-        gates, rotations = self.gates, self.rotations
-        if GATES in drawn:
-            gates, rotations = drawn[GATES][0], drawn[ROTATIONS][0] if self.is_directed else rotations
+        gates, rotations = (x[0] for x in self.poses(drawn))
         marked: dict[str, Any] = {"gates": gates, "gate_radius": self.gate_radius}
         if self.is_directed:
             marked["gate_rims"] = rims(gates, rotations, self.openings)
         if self.frame:
-            outer = torch.nn.functional.pad(
-                rims(gates, rotations, self.openings + self.frame), (0, 0, 0, 1), value=math.nan
-            )
+            outer = pad(rims(gates, rotations, self.openings + self.frame), (0, 0, 0, 1), value=math.nan)
             marked["shapes"] = [Shape.line(outer.flatten(0, 1))]
         return Markers("next gate", **marked, progress="gates_passed", success=success)
 

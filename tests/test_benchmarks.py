@@ -46,8 +46,8 @@ def run(tmp_path, monkeypatch):
     ("memory", "--num-envs 4 --modes eager --horizon 2 --rounds 1", 1),
     pytest.param("camera", "--primitives 2 --scenes trees --images 2x4x3 --rounds 1", 1, marks=pytest.mark.slow),
     ("racing", f"--tracks visfly --steps 16 --episodes 2 --cores 1 --runs runs --overrides {SMALL}", 1),
-    ("any_drone", f"--policies small --arenas drawn cf2p --episodes 2 --overrides total_steps=16 {SMALL}", 2),
-    pytest.param("any_drone", "--policies raptor --arenas l2f cf2p --episodes 2", 2, marks=THEIRS),
+    ("any_drone", f"--policies small --drones any shipped --episodes 2 --overrides total_steps=16 {SMALL}", 15),
+    pytest.param("any_drone", "--policies raptor --drones l2f --episodes 2", 1, marks=THEIRS),
     ("time_to_solve", f"--algorithms bptt --modes eager --overrides {SMALL} total_steps=16", 1),
     ("profile_recipes", f"--algorithms bptt --iterations 2 --skip 1 --overrides {SMALL}", 1),
     pytest.param("identification", "--seeds 1 --seconds 10", 10, marks=pytest.mark.slow),  # it simulates a flight
@@ -64,7 +64,7 @@ def test_a_benchmark_writes_a_table(name, arguments, rows, run, run_here, tmp_pa
         if hasattr(module, "identify"):
             quick = functools.partial(module.identify, fields=["linear_drag"], iterations=1, draws=2)
             monkeypatch.setattr(module, "identify", quick)
-        monkeypatch.setattr(module, "STEPS", 40, raising=False)
+        monkeypatch.setattr(module, "STEPS", 4, raising=False)
         if name in ("racing", "any_drone"):
             monkeypatch.setattr(module, "run", run_here)
 

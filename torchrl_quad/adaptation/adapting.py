@@ -36,7 +36,7 @@ _EVERY = 8  # of the states in an episode count for the bound, which is quicker
 class Adaptation:
     """What became of a policy, and why."""
 
-    policy: Any  #: to fly from now on: the better one, or a copy of the old one
+    policy: Any  #: the one to fly from now on, better or a copy of the old one
     changed: bool  #: whether it is another one
     reason: str  #: in a sentence
     fit: FlightFit | None  #: what the flights say; None where they could not be fitted

@@ -86,7 +86,7 @@ class AnyDrone(DroneRandomization):
         if layout.rotor_spin.shape[-1] != 4 or layout.mass.dim() > 1 or layout.rotor_direction is not None:
             raise UserValueError(f"{source}: any draws quadrotors with upright rotors. Write drone=cf2x.")
         self.ranges = {name: _checked(name, numbers, source) for name, numbers in {**RANGES, **given}.items()}
-        self.spec: Mapping[str, Any] = {"any": self.ranges}
+        self.spec: Mapping[str, Any] = {name: {"any": numbers} for name, numbers in self.ranges.items()}
         self.max_delay = int(self.ranges["delay"][1])
         self.full, places = thrust_limits(layout)[1], layout.rotor_positions[:, :2]
         self.rotors, self.directions = Rotors(layout), places / places.norm(dim=-1).mean()

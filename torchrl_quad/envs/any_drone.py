@@ -71,8 +71,9 @@ class AnyDrone(DroneRandomization):
     so that nothing gives away which one flies.
 
     Entries of the state: ``("drone", field)``; ``delay`` (1), control steps; and ``traits`` (9), of the order of one:
-    all of the drone that its motion depends on, for critics. They are the logarithms of thrust to weight and of the
-    greatest angular acceleration about x, y and z, ``rise``, ``fall``, ``drag``, ``drag_up``, and the delay.
+    all of the drone that its motion depends on but for gyroscopic torque, for critics. They are the logarithms of
+    thrust to weight and of the greatest angular acceleration about x, y and z, ``rise``, ``fall``, ``drag``,
+    ``drag_up``, and the delay.
     """
 
     def __init__(self, spec: str | Path | Mapping, layout: QuadrotorParams) -> None:

@@ -27,6 +27,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from benchmarks.paper.running import kept, run, side_by_side
 from benchmarks.report import RESULTS, command_line
 from torchrl_quad import HoveringEnv, available_drones, load_drone
+from torchrl_quad.deploy.simulators import simulator_class
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.rigid_body import Rotors
 from torchrl_quad.files import add_rows, machine, read_rows, replacing
@@ -173,8 +174,8 @@ def probe(pilot: Ours, n: int, path: Path) -> None:
     pilot.remembered = None
 
 
-def shipped(pilot: Any, n: int, name: str, delay: int) -> dict[str, float]:
-    """On a drone that ships, in our simulator: its rotors in the usual order, its frame turned and mirrored to fit."""
+def shipped(n: int, name: str, delay: int) -> HoveringEnv:
+    """A drone that ships, in our simulator: its rotors in the order of the policies, its frame turned to fit."""
     drone = load_drone(name)
     place, spin = drone.rotor_positions[:, :2], drone.rotor_spin
     if (place.abs().amin(-1) < 0.1 * place.norm(dim=-1)).all():  # a plus: turned by 45 degrees
@@ -188,7 +189,36 @@ def shipped(pilot: Any, n: int, name: str, delay: int) -> dict[str, float]:
     assert drone.rotor_spin.tolist() == SPIN, name
     options = {"control": "rotor_thrusts", "control_dt": DT, "max_episode_steps": STEPS, "action_delay": delay}
     start = {"tilt": 0.6, "velocity": 1.0, "angular_velocity": 1.0}
-    return in_ours(pilot, HoveringEnv(n, seed=STARTS, drone=drone, random_start=start, **options))
+    return HoveringEnv(n, seed=STARTS, drone=drone, random_start=start, **options)
+
+
+def in_mujoco(pilot: Any, n: int, name: str) -> dict[str, float]:
+    """On a drone that ships, in MuJoCo, as a contract describes it, with a delay of one step."""
+    env = shipped(n, name, delay=1)
+    rotors, full, state = Rotors(env.nominal), env.dynamics.controller.scale * 2.0, env.reset()["state"]
+    fields = {k: x.tolist() for k, x in env.nominal.to(dtype=torch.float64).fields().items()}
+    fields = {k: x[0] if len(x) == 1 else x for k, x in fields.items()}
+    limits = {"body_rate": {"range": [[-1.0, 1.0]] * 3}, "thrust": {"range": [0.0, 1.0]}}  # of the other modes
+    output = {"control": "rotor_thrusts", "gains": {}, **limits}
+    rest = {"control_dt": DT, "plant": {}, "camera": None, "obstacles": None}
+    simulator = simulator_class("mujoco")({"drone": fields, "output": output, **rest}, "contract", range(4))
+    names = ("position", "quaternion", "velocity", "angular_velocity")
+    simulator.reset({k: state[k].double().numpy() for k in names})
+    waiting = rotors.thrust(env.dynamics.controller.hover_speed).expand(n, 4)
+
+    def motion() -> Motion:
+        position, *rest = (torch.tensor(simulator.state()[k], dtype=torch.float32) for k in names)
+        return (position - state["target"], *rest)
+
+    def step(told: Tensor) -> Motion:
+        nonlocal waiting
+        slowest = env.nominal.rotor_speed_min
+        asked = rotors.thrust(slowest + told * (rotors.speed(full) - slowest)) if pilot.tells_speed else told * full
+        simulator.step(waiting.double().numpy())
+        waiting = asked
+        return motion()
+
+    return judge(pilot, motion(), step)
 
 
 def l2f_drone(rng: np.random.Generator, about: dict[str, Any]) -> dict[str, Any]:
@@ -252,8 +282,9 @@ ARENAS: dict[tuple[str, str], Callable[..., dict[str, float]]] = {
     ("any, no delay", ""): lambda pilot, n: in_ours(pilot, any_drone(n, delay=0)),
     ("any, tilted by 1.2", ""): lambda pilot, n: in_ours(pilot, any_drone(n, tilt=1.2)),
     ("l2f", ""): in_l2f,
-    **{("shipped", name): functools.partial(shipped, name=name, delay=1) for name in SHIPPED},
-    **{("shipped, no delay", name): functools.partial(shipped, name=name, delay=0) for name in SHIPPED},
+    **{("shipped", x): lambda pilot, n, x=x: in_ours(pilot, shipped(n, x, delay=1)) for x in SHIPPED},
+    **{("shipped, no delay", x): lambda pilot, n, x=x: in_ours(pilot, shipped(n, x, delay=0)) for x in SHIPPED},
+    **{("shipped, in MuJoCo", x): functools.partial(in_mujoco, name=x) for x in SHIPPED},
 }
 POLICIES = {"large": [], "small": ["actor.num_cells=[24]", "actor.hidden_size=24"], "raptor": []}
 KEY = ("policy", "seed", "drones", "drone")
@@ -302,7 +333,7 @@ def main() -> None:
             n = min(args.episodes, 128) if arena[1] else args.episodes
             found = {name: round(x, 2) for name, x in ARENAS[arena](pilot, n).items()}
             add_rows(args.output, [dict(zip(KEY, (policy, seed, *arena), strict=True)) | found | about])
-        if policy != "raptor":
+        if policy != "raptor" and ("any", "") in missing:
             probe(pilot, args.episodes, PICTURE if ships and (policy, seed) == ("large", 0) else folder / "probe.png")
 
     jobs = [(fly, name, seed) for seed in args.seeds for name in args.policies if name != "raptor" or seed == 0]

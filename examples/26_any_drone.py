@@ -1,4 +1,7 @@
-"""Train one policy that flies every quadrotor: it finds out in flight, from its memory, which one it flies."""
+"""Begin to train one policy for every quadrotor, which finds out in flight, from its memory, which one it flies.
+
+It comes to about 30 cm here; recipes/shac.py with tuned=shac_hovering_any goes on twenty times as long, to 1 cm.
+"""
 
 import torch
 from torchrl.envs.utils import ExplorationType
@@ -49,4 +52,4 @@ with torch.no_grad():
 result, numbers = test.episode_metrics(flight), sum(x.numel() for x in actor.parameters())
 mass = flight["state", "drone", "mass"][:, 0]
 print(f"{numbers} numbers fly drones of {mass.min():.2f} to {mass.max():.2f} kg that they have never flown:")
-print(f"solved {result['solved'].mean():.0%}, median error {100 * result['position_error'].median():.0f} cm")
+print(f"median distance to the target {100 * result['position_error'].median():.0f} cm, of 100 cm at the start")

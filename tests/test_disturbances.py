@@ -170,6 +170,8 @@ def test_any_drone_is_a_body_within_its_ranges_and_full_signal_is_all_that_its_o
     assert 2.0 <= weights.min() < 2.01 and 3.99 < weights.max() <= 4.0
     torch.testing.assert_close(state["traits"][:, :1], weights.log() - 1.0)
     assert state["traits"].abs().max() < 3.0 and state["traits"].std(0).min() > 0.1
+    described = env.disturbances["randomize"].spec  # as the contract of a policy says it
+    assert described["thrust_to_weight"] == {"any": [2.0, 4.0]} and len(described) == 12
 
 
 def test_a_command_takes_effect_after_the_delay_of_the_drawn_drone():

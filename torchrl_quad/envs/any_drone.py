@@ -71,8 +71,9 @@ class AnyDrone(DroneRandomization):
     so that nothing gives away which one flies.
 
     Entries of the state: ``("drone", field)``; ``delay`` (1), control steps; and ``traits`` (9), of the order of one:
-    all of the drone that its motion depends on, for critics. They are the logarithms of thrust to weight and of the
-    greatest angular acceleration about x, y and z, ``rise``, ``fall``, ``drag``, ``drag_up``, and the delay.
+    all of the drone that its motion depends on but for gyroscopic torque, for critics. They are the logarithms of
+    thrust to weight and of the greatest angular acceleration about x, y and z, ``rise``, ``fall``, ``drag``,
+    ``drag_up``, and the delay.
     """
 
     def __init__(self, spec: str | Path | Mapping, layout: QuadrotorParams) -> None:
@@ -86,7 +87,7 @@ class AnyDrone(DroneRandomization):
         if layout.rotor_spin.shape[-1] != 4 or layout.mass.dim() > 1 or layout.rotor_direction is not None:
             raise UserValueError(f"{source}: any draws quadrotors with upright rotors. Write drone=cf2x.")
         self.ranges = {name: _checked(name, numbers, source) for name, numbers in {**RANGES, **given}.items()}
-        self.spec: Mapping[str, Any] = {"any": self.ranges}
+        self.spec: Mapping[str, Any] = {name: {"any": numbers} for name, numbers in self.ranges.items()}
         self.max_delay = int(self.ranges["delay"][1])
         self.full, places = thrust_limits(layout)[1], layout.rotor_positions[:, :2]
         self.rotors, self.directions = Rotors(layout), places / places.norm(dim=-1).mean()

@@ -28,6 +28,8 @@ from torchrl_quad.deploy.simulators.vehicle import Drone
 from torchrl_quad.deploy.transfer import Mutant, _fly
 from torchrl_quad.dynamics import MotorCommand
 from torchrl_quad.identification import FlightLog
+from torchrl_quad.render.canvas import BLUE, INK, make_figure
+from torchrl_quad.render.canvas import save as write_picture
 from torchrl_quad.training.building import build_env
 from torchrl_quad.training.evaluation import load_policy
 
@@ -118,8 +120,22 @@ def row(name: str, bundle: Bundle, seed: int, **more: Any) -> dict[str, Any]:
     return {"policy": name, "seed": seed, **found, **more}
 
 
+def draw(rows: list[dict[str, Any]], path: str) -> None:
+    """The errors of all policies, a dot for each seed, and their means."""
+    figure = make_figure(figsize=(6.0, 2.6), layout="constrained")
+    axes = figure.subplots()
+    for k, name in enumerate(names := ["base", "integral", "random", "adapted"]):
+        errors = [float(row["error_cm"]) for row in rows if row["policy"] == name]
+        axes.semilogy([k] * len(errors), errors, "o", color=BLUE, alpha=0.5)
+        axes.semilogy([k - 0.2, k + 0.2], [np.mean(errors)] * 2, color=INK)
+    axes.set_xticks(range(4), names)
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.set_ylabel("error of hovering [cm]")
+    write_picture(figure, path, dpi=110)
+
+
 def main() -> None:
-    options = command_line(__doc__, "adaptation.csv", base="", others=[""], seeds=[0, 1, 2])
+    options = command_line(__doc__, "adaptation.csv", base="", others=[""], seeds=[0, 1, 2], picture="")
     rows = list(csv.DictReader(options.output.open())) if options.output.exists() else []
     done = {(x["policy"], int(x["seed"])) for x in rows}
     about = {"flights": FLIGHTS, "episodes": EPISODES}
@@ -151,6 +167,8 @@ def main() -> None:
             seconds = {f"seconds_{name}": f"{x:.2f}" for name, x in found.seconds.items()}
             rows.append(row("adapted", adapted, seed, kl=f"{found.kl:.2f}", changed=found.changed, **seconds))
             save(options.output, rows, **about)
+    if options.picture:
+        draw(rows, options.picture)
 
 
 if __name__ == "__main__":

@@ -107,6 +107,8 @@ def test_a_policy_that_no_step_improves_stays(log, hovering, monkeypatch):
 def test_what_cannot_be_adapted_is_refused_by_name(hovering):
     actor = make_actor(hovering)
     refuses("PointMass has no rotors", Adapter, actor, HoveringEnv(num_envs=2, dynamics="point_mass"))
+    any_drone = HoveringEnv(num_envs=2, randomize="any", control="rotor_thrusts")
+    refuses("for any drone", Adapter, actor, any_drone, MOTORS)
     refuses("no motor_command", Adapter, actor, hovering)
     refuses("GeometricController is no policy", Adapter, GeometricController(hovering), hovering, error=TypeError)
     refuses("must be a QuadrotorEnv", Adapter, actor, None, MOTORS, error=TypeError)

@@ -20,6 +20,7 @@ from torchrl_quad.data import differentiable_rollout, restart
 from torchrl_quad.data.unwrap import base_env, leaf
 from torchrl_quad.dynamics import MotorCommand, Quadrotor
 from torchrl_quad.envs import QuadrotorEnv
+from torchrl_quad.envs.any_drone import AnyDrone
 from torchrl_quad.envs.metrics import first_episode
 from torchrl_quad.errors import Unsupported, UserTypeError, UserValueError
 from torchrl_quad.identification import FlightLog, LogError, prediction
@@ -110,6 +111,11 @@ class Adapter:
             raise Unsupported(
                 f"Adapter: a {type(base.dynamics).__name__} has no rotors, which the motor commands of a log turn. "
                 "Train the policy in dynamics='quadrotor'."
+            )
+        if isinstance(base.disturbances.get("randomize"), AnyDrone):
+            raise Unsupported(
+                "Adapter: a policy for any drone (randomize='any') acts on no nominal drone, which a fit could differ "
+                "from. Its memory adapts it in flight: train it with actor.recurrent=true."
             )
         if "depth" in policy.in_keys:
             raise Unsupported("Adapter: this policy reads images, which no log holds. Train with actor.vision=false.")

@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_quad.dynamics import import_drone, presets
-from torchrl_quad.errors import UserError, UserValueError, shown
+from torchrl_quad.errors import UserValueError, run_program, shown
 from torchrl_quad.files import make_folder, replacing
 
 
 def main() -> None:
-    sys.stdout.reconfigure(errors="backslashreplace")  # names of files may be anything
     if len(sys.argv) < 2 or {"-h", "--help"} & set(sys.argv):
         print(__doc__)
         return
@@ -47,8 +46,4 @@ def settings(arguments: list[str]) -> tuple[Path, dict[str, Any]]:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (UserError, OSError) as error:
-        print("Error:", " ".join(str(error).split()), file=sys.stderr)
-        raise SystemExit(2) from None
+    run_program(main)

@@ -25,12 +25,11 @@ from torchrl_quad.deploy import load_bundle
 from torchrl_quad.deploy.contract import naming
 from torchrl_quad.deploy.simulators import simulator_class
 from torchrl_quad.deploy.transfer import MUTANTS, measure, table
-from torchrl_quad.errors import MissingPackage, UserError, UserValueError, shown
+from torchrl_quad.errors import MissingPackage, UserValueError, run_program, shown
 from torchrl_quad.files import make_folder
 
 
 def main() -> None:
-    sys.stdout.reconfigure(errors="backslashreplace")  # names of files may be anything
     if {"-h", "--help"} & set(sys.argv):
         print(__doc__)
         return
@@ -115,11 +114,4 @@ SETTINGS: dict[str, tuple[Any, Any]] = {  # how each is read, if it is not text,
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (UserError, OSError) as error:
-        print("Error:", " ".join(str(error).split()), file=sys.stderr)
-        raise SystemExit(2) from None
-    except KeyboardInterrupt:
-        print("Stopped. What is finished is kept.", file=sys.stderr)
-        raise SystemExit(130) from None
+    run_program(main)

@@ -48,6 +48,22 @@ def test_a_target_critic_follows_as_with_torchrl_s_soft_update(kind, critic):
     torch.testing.assert_close(own, torchrl)
 
 
+@cases((SHACLoss, make_value), (ABPTLoss, make_qvalue))
+def test_a_critic_of_a_recipe_reads_what_its_policy_does_not_see(kind, make):
+    section = {"num_cells": [8], "activation": "ELU", "input_scale": [0.5, 0.001], "lmbda": 0.95}
+    section |= {"in_keys": ["observation", ["state", "rotor_speed"]]}
+    cfg = OmegaConf.create({"critic": section, "normalize": False, "loss": {}, "gamma": 0.99})
+    env = HoveringEnv(num_envs=3)
+    actor = make_actor(env)
+    loss = building.make_loss(kind, cfg, env, actor, make)
+    rollout, _ = differentiable_rollout(env, actor, None, 4)
+    before = loss(rollout)
+    rollout["next", "state"] = rollout["next", "state"].apply(lambda x: x)
+    rollout["next", "state", "rotor_speed"] = 0.5 * rollout["next", "state", "rotor_speed"]
+    assert loss(rollout)["loss_actor"] != before["loss_actor"]
+    assert ("state", "rotor_speed") in loss.in_keys and ("state", "rotor_speed") not in actor.in_keys
+
+
 @cases(("constant", 1e-2, 1e-2), ("linear", 5.05e-3, 1e-4), ("exponential", 1e-3, 1e-4), ("cosine", 5.05e-3, 1e-4))
 def test_a_schedule_goes_from_the_first_to_the_last_learning_rate(schedule, halfway, last):
     adam = optimizer(100, schedule=schedule)

@@ -22,6 +22,7 @@ from torchrl_quad.training.schema import check
 AFTER_TRAINING = ("evaluate", "export")  # recipes that read a checkpoint
 SMOKE = {  # the tests that run a program on a reduced budget
     **{f"recipes/{name}.py": "test_recipes" for name in (*RECIPES, "evaluate")},
+    "recipes/adapt.py": "test_adaptation",
     "recipes/export.py": "test_deploy_faults",
     "recipes/identify.py": "test_identification",
     "recipes/import_drone.py": "test_drones",
@@ -29,6 +30,7 @@ SMOKE = {  # the tests that run a program on a reduced budget
     "benchmarks/paper/reproduce.py": "test_reproduce",
     "benchmarks/paper/results.py": "test_claims",
     **{f"benchmarks/{path.name}": "test_benchmarks" for path in ROOT.glob("benchmarks/*.py")},
+    "benchmarks/adaptation.py": "test_adaptation",
     "python -m build": "test_package",
     "wandb": "test_logs",
     "tensorboard": "test_logs",

@@ -149,6 +149,74 @@ def test_the_noise_has_the_size_asked_for_and_rewards_do_not_see_it():
     assert torch.equal(flight["next", "reward"], fly(silent, silent.reset(), hold(env, 3))["next", "reward"])
 
 
+def any_drone(n, **options):
+    options = {"drone": "cf2x", "control": "rotor_thrusts", "randomize": "any", "dtype": torch.float64, **options}
+    return HoveringEnv(num_envs=n, **options)
+
+
+def test_any_drone_is_a_body_within_its_ranges_and_full_signal_is_all_that_its_own_rotors_give():
+    env = any_drone(2000, randomize={"any": {"thrust_to_weight": [2.0, 4.0]}})
+    td = env.reset()
+    state = td["state"]
+    mass, inertia, lag = (state["drone", x] for x in ("mass", "inertia", "motor_time_constant"))
+    assert 0.02 <= mass.min() < 0.03 and 4.8 < mass.max() <= 5.0 and lag[:, 1].max() > 2.8 * lag[:, 0].max()
+    assert (inertia <= inertia.sum(-1, keepdim=True) - inertia + 1e-12).all()
+    assert [(state["delay"] == k).sum().item() for k in range(4)] == pytest.approx([500] * 4, abs=70)
+    end = fly(env, td, [torch.ones(2000, 4, dtype=torch.float64)] * 4)
+    signal = end["next", "state", "rotor_speed"][:, -1] / env.nominal.rotor_speed_max
+    assert (signal <= 1.0).all() and (signal[:, 0] > state["rotor_speed"][:, 0] / env.nominal.rotor_speed_max).all()
+    full = 4 * state["drone", "thrust_map"][:, :1] * env.nominal.rotor_speed_max**2
+    weights = full / mass / 9.81
+    assert 2.0 <= weights.min() < 2.01 and 3.99 < weights.max() <= 4.0
+    torch.testing.assert_close(state["traits"][:, :1], weights.log() - 1.0)
+    assert state["traits"].abs().max() < 3.0 and state["traits"].std(0).min() > 0.1
+
+
+def test_a_command_takes_effect_after_the_delay_of_the_drawn_drone():
+    env = any_drone(64)
+    td = env.reset()
+    hover = env.hover_action.expand(64, 4).clone()
+    still, push = fly(env, td, [hover] * 5), fly(env, td, [hover + 0.5, *[hover] * 4])
+    moved = (push["next", "state", "rotor_speed"] != still["next", "state", "rotor_speed"]).any(-1)
+    first = moved.double().argmax(1, keepdim=True)
+    assert moved.any(1).all() and torch.equal(first, td["state", "delay"])
+    assert set(first.flatten().tolist()) == {*range(env.action_delay + 1)} == {0, 1, 2, 3}
+
+
+def test_gradients_through_any_drone_agree_with_finite_differences():
+    env = any_drone(3, observe_last_action=True)
+    start = env.reset()["state"]
+    actions = (env.hover_action + 0.1 * torch.randn(3, 6, 4, dtype=torch.float64)).requires_grad_()
+    mass = start["drone", "mass"].clone().requires_grad_()
+
+    def observations(actions, mass):
+        state = start.clone(recurse=True)
+        state["drone", "mass"] = mass
+        ends = fly(env, env.reset(TensorDict({"state": state}, [3]), set_state=True), actions.unbind(1))["next"]
+        return torch.cat((ends["reward"].flatten(), ends["observation"].flatten()))
+
+    assert torch.autograd.gradcheck(observations, (actions, mass), fast_mode=True, atol=1e-6, rtol=1e-5)
+
+
+@cases(
+    ({"control": "rates"}, "draws the whole drone, of which no flight controller knows; got control='rates'"),
+    ({"action_delay": 2}, r"action_delay=2 would change nothing. Write randomize={'any': {'delay': \[0, 2\]}}"),
+    ({"drone": "typhoon_h480"}, "any draws quadrotors with upright rotors"),
+    ({"randomize": {"any": {"weight": [1, 2]}}}, "any draws no 'weight'. Choose from: mass, thrust_to_weight, arm"),
+    ({"randomize": {"any": {"mass": 1.0}}}, "mass must .* Give two numbers, low and high"),
+    ({"randomize": {"any": {"thrust_to_weight": [0.9, 2]}}}, "two numbers, low and high, between 1.01 and 50; got"),
+    (
+        {"randomize": {"any": {"arm": [0.01, 0.1], "inertia": [0.01, 1]}}},
+        "not all possible: .* 'inertia' must be between",
+    ),
+    ({"randomize": {"any": {"delay": [0, 2.5]}}}, "delay needs two whole numbers"),
+    ({"randomize": {"any": {}, "mass": {"scale": [1, 2]}}}, "any draws the whole drone, and takes ranges, such as"),
+    ({"randomize": {"any": {"delay": [0, 0]}}, "observe_last_action": True}, "with action_delay=0 there are none"),
+)
+def test_a_distribution_of_any_drone_that_cannot_be_is_refused(options, message):
+    refuses(message, any_drone, 1, **options)
+
+
 def test_random_starts_tilt_turn_and_push_within_their_bounds():
     state = HoveringEnv(num_envs=4000, random_start=EVERYTHING["random_start"]).reset()["state"]
     up = quaternion.rotate(state["quaternion"], torch.tensor([0.0, 0.0, 1.0]).expand(4000, 3))

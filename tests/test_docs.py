@@ -22,6 +22,7 @@ PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "recipes/READM
 PAGES += sorted(path for path in ROOT.glob("docs/**/*.md") if "_build" not in path.parts)
 PARTS = {path.parent.name for path in ROOT.glob("torchrl_quad/*/__init__.py")} - {"training"}  # which recipes use
 PUBLIC = ["torchrl_quad", *(f"torchrl_quad.{part}" for part in sorted(PARTS))]
+FIRST = (ROOT / "examples/03_train.py").read_text().split('"""\n\n', 1)[1]  # the program, which test_examples.py runs
 # Blocks that are not run: text, data, and Sphinx's directives, except those that hold code.
 NOT_RUN = re.compile(r"(|text|yaml|\{(?!code|sourcecode)[\w-]+\}.*)")
 
@@ -90,7 +91,8 @@ def look_at(site, browser):
     page.on("request", lambda r: None if r.url.startswith("file://") else wrong.append(r.url))
     listings = sorted((site / "source").rglob("*.html"))  # which show files of the repository
     assert listings
-    classes = sorted(site.glob("_api/*.html"), key=lambda path: path.stat().st_size)  # the longest stand for all
+    classes = sorted(site.glob("docs/_api/*.html"), key=lambda path: path.stat().st_size)  # the longest stand for all
+    assert len(classes) > 6
     for path in {*site.rglob("*.html")} - {*listings[1:], *classes[:-6], site / "index.html"}:
         name = str(path.relative_to(site))
         page.goto(path.as_uri())
@@ -116,10 +118,9 @@ def test_the_reference_lists_what_the_package_exports_and_every_example_is_liste
 
 def test_the_first_program_is_the_same_everywhere():
     """The program of example 3 (which test_examples.py runs) is the first of each of these pages."""
-    program = (ROOT / "examples/03_train.py").read_text().split('"""\n\n', 1)[1]
     for name in ("README.md", "docs/index.md", "docs/first_flight.md"):
         text = (ROOT / name).read_text()
-        assert code(ROOT / name, "python")[0][1] == program, name
+        assert programs(ROOT / name)[0] == FIRST, name
         assert "about 40 s on one CPU" in text
 
 
@@ -167,10 +168,14 @@ def code(page, language):
     return [(line, content) for kind, line, content in blocks(page.read_text()) if kind == language]
 
 
+def programs(page):
+    return [content for _, content in code(page, "python")]
+
+
 def files():
     """The programs of the pages on writing that stand in files, by the name in their first line."""
-    programs = [content for page in ROOT.glob("docs/writing*.md") for _, content in code(page, "python")]
-    return {content.split()[1]: content for content in programs if re.match(r"# \w+\.py\n", content)}
+    found = [content for page in ROOT.glob("docs/writing*.md") for content in programs(page)]
+    return {content.split()[1]: content for content in found if re.match(r"# \w+\.py\n", content)}
 
 
 @pytest.fixture
@@ -192,12 +197,13 @@ def test_nothing_escapes_these_tests_behind_another_name(page):
 
 
 @pytest.mark.usefixtures("quick_fits")
-@pytest.mark.parametrize("page", [page for page in PAGES if code(page, "python")], ids=name_of)
+@pytest.mark.parametrize("page", [page for page in PAGES if programs(page) not in ([], [FIRST])], ids=name_of)
 def test_the_programs_of_a_page_run_one_after_the_other(page, tmp_path, monkeypatch, importable):
     lines = []  # the code, on the same lines as in the page
+    elsewhere = files().values()  # the others import it, or test_own_tasks.py does
     for line, content in code(page, "python"):
-        if content in files().values():
-            continue  # the others import it, or test_own_tasks.py does
+        if content in elsewhere:
+            continue
         lines += [""] * (line - len(lines)) + content.splitlines()
     program = tmp_path / f"{page.stem}.py"
     program.write_text(reduced("\n".join(lines)))

@@ -11,11 +11,11 @@ import pytest
 EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("*.py"))
 BUDGET = re.compile(r"^(STEPS|ITERATIONS) = [\d_]+$", flags=re.MULTILINE)
 LONG = {r"(?<=rollout\()256\b|(?<=actor, None, )256\b": "20", r"\(8, 16, 32, 64\)": "(2, 4)"}
-LONG["max_envs=8"] = "max_envs=2"
+LONG |= {"max_envs=8": "max_envs=2", r"(?<=actor, carry, )\d\d\b": "8", r"(?<=ForestEnv\(num_envs=)\d+": "2"}
 
 
 def reduced(program):
-    """A program on a budget of two, whose final flights are short."""
+    """A program on a budget of two, whose horizons and final flights are short."""
     for long, short in LONG.items():
         program = re.sub(long, short, program)
     return BUDGET.sub(r"\1 = 2", program)

@@ -154,6 +154,7 @@ def test_transforms_and_memory_fly_inside_the_compiled_step(backend):
         recurrent=True,
         backend=backend,
         wind={"gust": 0.5},
+        control_dt=0.005,  # a physics step
     )
 
 

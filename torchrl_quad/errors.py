@@ -4,6 +4,8 @@ The recipes end in one line for these; every other error is a mistake of a progr
 """
 
 import reprlib
+import sys
+from collections.abc import Callable
 from typing import Any
 
 
@@ -56,3 +58,16 @@ def shown(value: Any) -> str:
 def one_line(text: object) -> str:
     """The message of a library in one line of at most 200 characters, without what would garble it."""
     return "".join(x if x.isprintable() else " " for x in " ".join(str(text).split()))[:200]
+
+
+def run_program(main: Callable[[], None]) -> None:
+    """Run a program without hydra: what the user got wrong ends it in one line and status 2, and Ctrl-C in 130."""
+    sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]  # names of files may be anything
+    try:
+        main()
+    except (UserError, OSError) as error:
+        print("Error:", " ".join(str(error).split()), file=sys.stderr)
+        raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        print("Stopped. What is finished is kept.", file=sys.stderr)
+        raise SystemExit(130) from None

@@ -104,7 +104,8 @@ def differentiable_rollout(
             buffer.detach_()
     if (shared := getattr(base, "shared_tensordict_parent", None)) is not None:  # of SerialEnv
         shared.detach_()
-    end = env.step_mdp(cast(TensorDictBase, rollout[..., -1])).detach().clone()
+    with torch.no_grad():
+        end = env.step_mdp(cast(TensorDictBase, rollout[..., -1])).clone()
     state = cast(Composite, env.state_spec)
     specs = (*observed(env).keys(True, True), *state.keys(True, True), *cast(Iterable[NestedKey], env.action_keys))
     known = set(map(unravel_key, specs))

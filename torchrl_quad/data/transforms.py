@@ -44,6 +44,7 @@ from torchrl_quad.data.values import (
     inverse,
     written_by,
 )
+from torchrl_quad.engine.packing import looks_are_free
 from torchrl_quad.engine.policy import ENDS
 from torchrl_quad.errors import UserValueError
 
@@ -106,16 +107,16 @@ class Flown(NamedTuple):
             entries = start.copy().set(cast(Any, env).action_key, cast(Any, env).action_spec.zero())
             while isinstance(env, TransformedEnv):
                 env, entries = env.base_env, env.transform.inv(entries)
-        spec = {unravel_key(key): x for key, x in observed(base).items(True, True)}
-        spec |= {key: base.full_done_spec[key] for key in base.done_keys}
+        spec = dict(observed(base).items(True, True)) | {key: base.full_done_spec[key] for key in base.done_keys}
+        given = cast(dict[Any, Tensor], dict(start.items(True, True)))
         found = {key: leaf(entries, key) for key in map(unravel_key, base.state_keys)}
         wanted = {*spec, *self.memory}
-        for is_entry in (True, False):
-            for key, value in self.known.items():
-                if value is None or (value.kind == "entry") != is_entry or wanted.isdisjoint(value.sources()):
-                    continue
-                if key in start:
-                    value.undo(leaf(start, key), found, spec)
+        values = [(key, value) for key, value in self.known.items() if value is not None and key in given]
+        for key, value in sorted(
+            values, key=lambda pair: pair[1].kind != "entry"
+        ):  # what is there as it was comes first
+            if not wanted.isdisjoint(value.sources()):
+                value.undo(given[key], found, spec)
         if not spec.keys() <= found.keys():  # a transform leaves some out
             again = base.reset(entries.select("state"), set_state=True)
             found |= {key: leaf(again, key) for key in spec.keys() - found.keys()}
@@ -408,8 +409,12 @@ def _count(transform: Any, root: TensorDictBase, after: TensorDictBase, start: T
         if isinstance(transform, RewardSum | TargetReturn):
             is_sum = isinstance(transform, RewardSum)
             value, roots, ends = leaf(start, key), [], []
-            for reward, restarts in zip(leaf(after, transform.in_keys[i]).unbind(1), begun.unbind(1), strict=True):
-                value = torch.where(restarts, 0.0 if is_sum else cast(float, transform.target_return), value)
+            anew = 0.0 if is_sum else cast(float, transform.target_return)
+            some = begun.any(0).flatten().tolist() if looks_are_free(done.device) else [True] * done.shape[1]
+            for reward, who, any_of in zip(
+                leaf(after, transform.in_keys[i]).unbind(1), begun.unbind(1), some, strict=True
+            ):
+                value = torch.where(who, anew, value) if any_of else value
                 roots.append(value)
                 value = value + reward if is_sum else value - reward if transform.mode == "reduce" else value
                 ends.append(value)

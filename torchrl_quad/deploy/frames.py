@@ -68,6 +68,7 @@ class Convention:
     thrust_range: tuple[float, float] | None = None  #: their commands for no and full thrust; None where in newtons
     thrust_limit: float = 1.0  #: the share of this range that may be commanded
     whole_thrust: bool = False  #: whether their command is a whole number
+    idle: float = 0.0  #: the share of the motors' signal that their command for no thrust leaves
 
     def of(self, rotor_positions: ArrayLike) -> Convention:
         """The same for a drone with its rotors at (4, 2 or 3) [m], as its contract lists them, in any order.
@@ -102,9 +103,9 @@ class Convention:
         Args:
             newtons: our collective thrust.
             full_thrust: the thrust [N] of their full command, unless the target takes newtons: weight / hover command,
-                and for a Crazyflie 4 THRUST_MAX.
-            model_factor: f of the thrust curve f s^2 + (1 - f) s of the signal s, where the target does not undo it
-                itself. PX4 does, by THR_MDL_FAC, and ArduPilot, by MOT_THST_EXPO: leave it 0 there.
+                and for a Crazyflie 4 THRUST_MAX. For Betaflight betaflight.txt in a bundle has both.
+            model_factor: f of the thrust curve f s^2 + (1 - f) s of the motors' signal s, where the target does not
+                undo it itself. PX4 does, by THR_MDL_FAC, and ArduPilot, by MOT_THST_EXPO: leave it 0 there.
 
         Raises:
             ValueError: a thrust is not finite, full_thrust is missing or not above 0, or model_factor is not in 0 to 1.
@@ -115,7 +116,8 @@ class Convention:
         if self.thrust_range is None:
             return x
         low, high = self.thrust_range
-        share = motor_signal(x / self._full_thrust(full_thrust), model_factor)
+        signal = motor_signal(x / self._full_thrust(full_thrust), model_factor)
+        share = (signal - self.idle) / (1.0 - self.idle)
         command = low + (high - low) * np.clip(share, 0.0, self.thrust_limit)
         return np.rint(command).astype(int) if self.whole_thrust else command
 
@@ -124,8 +126,8 @@ class Convention:
         if self.thrust_range is None:
             return np.asarray(command, float)
         low, high = self.thrust_range
-        share = motor_thrust((np.asarray(command, float) - low) / (high - low), model_factor)
-        return self._full_thrust(full_thrust) * share
+        share = (np.asarray(command, float) - low) / (high - low)
+        return self._full_thrust(full_thrust) * motor_thrust(self.idle + (1.0 - self.idle) * share, model_factor)
 
     def _full_thrust(self, value: float | None) -> float:
         if value is None or not 0.0 < value < np.inf:
@@ -172,12 +174,23 @@ def ardupilot(world: str = "enu") -> Convention:
     return _aerospace("ArduPilot", world, (0.0, 1.0))
 
 
-def betaflight(sitl: bool = False) -> Convention:
-    """Betaflight: rates [deg/s] as its sticks count them, roll right, pitch forward, yaw right; throttle 1000 to 2000
-    us. It estimates no position. ``sitl``: the order of the motor packets of its simulator target, not of its
-    outputs."""
-    motors = (3, 1, 0, 2) if sitl else (2, 3, 1, 0)
-    return Convention("Betaflight", motors=motors, rates=(DEGREES, DEGREES, -DEGREES), thrust_range=(1000.0, 2000.0))
+def betaflight(sitl: bool = False, min_check: float = 1000.0, motor_idle: float = 0.0) -> Convention:
+    """Betaflight: rates [deg/s] as its sticks count them, roll right, pitch forward, yaw right; throttle up to 2000 us.
+    It estimates no position, and does not undo the thrust curve: give ``model_factor``, and set thrust_linear to 0.
+
+    Args:
+        sitl: the order of the motor packets of its simulator target, not of its outputs.
+        min_check: the throttle [us] up to which it hears none; the firmware's default is 1050.
+        motor_idle: what its motors get then, a share of their signal. Its setting of this name counts in 0.01 %, and
+            has the default 550. A throttle t makes idle + (1 - idle) (t - min_check) / (2000 - min_check).
+    """
+    if not (750.0 <= min_check < 2000.0 and 0.0 <= motor_idle < 1.0):
+        raise UserValueError(
+            f"min_check must lie from 750 to below 2000 us, and motor_idle from 0 to below 1, got {min_check!r} and "
+            f"{motor_idle!r}. Write 1050 and 0.055 for the firmware's defaults."
+        )
+    motors, rates = (3, 1, 0, 2) if sitl else (2, 3, 1, 0), (DEGREES, DEGREES, -DEGREES)
+    return Convention("Betaflight", motors=motors, rates=rates, thrust_range=(min_check, 2000.0), idle=motor_idle)
 
 
 def crazyflie(manual: bool = False) -> Convention:

@@ -12,8 +12,7 @@ import torch
 
 from torchrl_quad.dynamics.control import FlightController
 from torchrl_quad.dynamics.gains import suggest_gains
-from torchrl_quad.dynamics.import_mappings import MAPPINGS, READABLE, Array, Found, Said, read_json
-from torchrl_quad.dynamics.import_xml import read_xml
+from torchrl_quad.dynamics.import_formats import MAPPINGS, READABLE, Array, Found, Said, read_json, read_xml
 from torchrl_quad.dynamics.parameters import FIELDS, QuadrotorParams, read_drone, read_fields
 from torchrl_quad.errors import UserValueError, one_line, shown
 

@@ -1,5 +1,7 @@
 """YAML presets: by the name of one that ships with the package, by path, or as a mapping."""
 
+import copy
+import functools
 import numbers
 import re
 import tomllib
@@ -44,10 +46,15 @@ def read(kind: str, preset: str | Path | Mapping, folder: Traversable | None = N
     if not path.is_file():  # which a pipe or a device is not, whose reading may never end
         raise FileNotFoundError(f"No {kind} file at {path}. {choices} the path of a .yaml file that exists.")
     with path.open("rb") as file:
-        values = (parse_toml if source.endswith(".toml") else parse)(file.read(MAX_BYTES + 1), source)
+        values = copy.deepcopy(_parsed(file.read(MAX_BYTES + 1), source))
     if not isinstance(values, Mapping):
         raise UserValueError(f"{source}: expected a mapping of names to values, got {type(values).__name__}.")
     return source, values
+
+
+@functools.lru_cache(maxsize=64)  # each environment reads its drone again, and a file takes milliseconds
+def _parsed(content: bytes, source: str) -> Any:
+    return (parse_toml if source.endswith(".toml") else parse)(content, source)
 
 
 def parse(content: bytes, source: str) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -17,6 +18,7 @@ from torchrl_quad.dynamics.rigid_body import Integrator
 from torchrl_quad.engine import Stepper, can_fly, flies_inside, fly, has_compiler, nested
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs import config, guard
+from torchrl_quad.envs.any_drone import AnyDrone
 from torchrl_quad.envs.markers import merge_reset, visible_state
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenes import MountedCamera
@@ -33,7 +35,9 @@ class _Build(type(EnvBase)):
                 "auto_reset=True is for environments that reset themselves in the step that ends an episode, and this "
                 "one waits for a reset. Leave it out: rollouts and collectors reset where an episode ends."
             )
-        return super().__call__(*args, **kwargs)
+        env = super().__call__(*args, **kwargs)
+        env._built_with = dict(zip(list(inspect.signature(cls).parameters), args, strict=False)) | kwargs
+        return env
 
 
 @checked
@@ -61,6 +65,7 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         control: what an action (4) in [-1, 1] commands: "rates" (thrust, body rates), "attitude" (thrust, roll, pitch,
             yaw rate), "rotor_thrusts" (n, of n rotors), "velocity" (and yaw rate), or a mapping with limits, such as
             {mode: velocity, max_speed: 5.0}. See ``docs/actions.md``.
+        firmware: "betaflight" for the rate loop of :class:`~torchrl_quad.dynamics.Betaflight`, to train for it.
         dt: the physics step, 1e-6 to 0.1 s.
         control_dt: the control step, 1e-6 to 1 s, 1 to 200 times dt. Hovering is judged by its last second.
         action_delay: control steps from a command to its effect, 0 to 1000; 1 is usual.
@@ -72,7 +77,9 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         weights: other weights of reward terms, by name, each within a million: ``{"velocity": 0.0}``.
         event_discount: the discount per control step by which the time of an event counts, above 0, at most 1; None
             for no gradient in it.
-        randomize: draws a drone for each episode; see :class:`~torchrl_quad.envs.disturbances.DroneRandomization`.
+        randomize: draws a drone for each episode, about this one, as
+            :class:`~torchrl_quad.envs.disturbances.DroneRandomization` says; or "any" of all quadrotors, as
+            :class:`~torchrl_quad.envs.any_drone.AnyDrone` says.
         wind: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.Wind`, or an instance.
         random_start: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.RandomStart`, or an instance.
         disturbances: your own, a list; see :class:`~torchrl_quad.envs.disturbances.Disturbance`. Each is an instance, a
@@ -88,6 +95,7 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
     """
 
     batch_locked, _supports_set_state = True, True
+    _built_with: dict[str, Any]  # its arguments, by name
 
     def __init__(
         self,
@@ -99,6 +107,7 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         drone: config.DroneOption = "visfly",
         dynamics: config.DynamicsOption = "quadrotor",
         control: config.ControlOption = "rates",
+        firmware: config.FirmwareOption = None,
         dt: PhysicsStep = 0.005,
         control_dt: config.ControlPeriod = 0.02,
         action_delay: Delay = 1,
@@ -116,11 +125,10 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         scene: config.SceneOption = None,
         camera: config.CameraOption = None,
     ) -> None:
-        if action_delay == 0 and observe_last_action:
-            raise UserValueError("observe_last_action shows commands on their way; with action_delay=0 there are none.")
         # What is built of these is built again on another device.
         self._options: dict[str, Any] = {
-            "dynamics": dynamics, "control": control, "dt": dt, "control_dt": control_dt, "integrator": integrator,
+            "dynamics": dynamics, "control": control, "firmware": firmware, "dt": dt, "control_dt": control_dt,
+            "integrator": integrator,
             "random_start": random_start, "randomize": randomize, "wind": wind, "observation_noise": observation_noise,
             "observation_delay": observation_delay, "disturbances": config.as_disturbances(disturbances),
             "scene": scene, "camera": camera,
@@ -135,6 +143,11 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         config.check_params(params, num_envs)
         self.weights = config.known_weights(self.weights, weights or {})
         self._place(params)
+        drawn = self.disturbances.get("randomize")
+        if isinstance(drawn, AnyDrone):
+            self.action_delay = drawn.queue_length(action_delay)
+        if self.action_delay == 0 and observe_last_action:
+            raise UserValueError("observe_last_action shows commands on their way; with action_delay=0 there are none.")
         self._params = params if params.requires_grad or params.rotor_effectiveness is not None else self.nominal
         self.randomness.seed(seed)
         self.set_up()
@@ -245,6 +258,15 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         from torchrl_quad.render.video import draw_frame  # matplotlib is needed only here
 
         return draw_frame(self, drones, size)
+
+    def rebuilt(self, **changes: Any) -> Any:
+        """The same environment with other arguments, built again: ``env.rebuilt(num_envs=8, wind=None)``. It flies the
+        same drone, from its own starts."""
+        now = {"compile": self._stepper.options or self.is_compiled, "device": self.device}
+        env = cast(Any, type(self))(**{**self._built_with, **now, **changes})
+        if self.params is not self.nominal:
+            env.set_params(self.params)
+        return env
 
     def _place(self, drone: QuadrotorParams) -> None:
         """Build what holds tensors on the device and in the precision of the environment."""

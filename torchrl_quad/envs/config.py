@@ -7,13 +7,14 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import AfterValidator
 
 from torchrl_quad.dynamics import DYNAMICS, Dynamics, QuadrotorParams
 from torchrl_quad.dynamics.gains import MAX_SUBSTEPS
+from torchrl_quad.envs.any_drone import any_drone
 from torchrl_quad.envs.disturbances import Disturbance, DroneRandomization, RandomStart, Sensors, Wind
 from torchrl_quad.envs.scenes import MountedCamera, Scene
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
@@ -57,6 +58,7 @@ DroneOption = Annotated[
     Any, accepted(lambda x: isinstance(x, str | Path | Mapping | QuadrotorParams) and x != "", _DRONE)
 ]
 DynamicsOption = Annotated[Any, AfterValidator(_dynamics)]
+FirmwareOption = Literal["betaflight"] | None
 ControlOption = Annotated[
     Any, accepted(lambda x: isinstance(x, str | Mapping), "a name, such as rates, or a mapping with limits")
 ]
@@ -65,7 +67,7 @@ WindOption = Annotated[Any, buildable(Wind, "wind")]
 StartOption = Annotated[Any, buildable(RandomStart, "random_start")]
 RandomizeOption = Annotated[
     Any,
-    accepted(lambda x: isinstance(x, str | Path | Mapping | None) and x != "", "a mapping, or the path of a YAML file"),
+    accepted(lambda x: isinstance(x, str | Path | Mapping | None) and x != "", "any, a mapping, or the path of a file"),
 ]
 DisturbancesOption = Annotated[Any, AfterValidator(lambda value: as_disturbances(value) and value)]
 SceneOption = Annotated[Any, AfterValidator(_scene)]
@@ -100,7 +102,9 @@ def as_disturbances(value: Any, setting: str = "disturbances") -> list[Disturban
 def build_dynamics(nominal: QuadrotorParams, options: Mapping[str, Any]) -> Dynamics:
     """The model of the drone; a UserValueError says which options do not fit each other."""
     dt, control_dt, control = options["dt"], options["control_dt"], options["control"]
-    model: Callable[..., Dynamics] = DYNAMICS[options["dynamics"]]
+    model: Callable[..., Dynamics] = DYNAMICS[options["firmware"] or options["dynamics"]]
+    if options["firmware"] and options["dynamics"] not in ("quadrotor", options["firmware"]):
+        raise UserValueError(f"firmware={options['firmware']!r} flies a quadrotor. Leave out dynamics=...")
     takes_control = "control" in inspect.signature(model).parameters
     if not takes_control and control != "rates":
         raise UserValueError(
@@ -114,6 +118,13 @@ def build_dynamics(nominal: QuadrotorParams, options: Mapping[str, Any]) -> Dyna
             f"{dt}. Try control_dt={min(max(substeps, 1), MAX_SUBSTEPS) * dt:g}."
         )
     more = {"control": control} if takes_control else {}
+    if drawn := any_drone(options["randomize"], nominal):
+        if control != "rotor_thrusts":
+            raise UserValueError(
+                f"randomize='any' draws the whole drone, of which no flight controller knows; got "
+                f"control={shown(control)}. Write control='rotor_thrusts'."
+            )
+        nominal = drawn.middle
     return model(nominal, dt=dt, substeps=substeps, integrator=options["integrator"], **more)
 
 
@@ -126,7 +137,8 @@ def build_disturbances(
         chosen["random_start"] = build(RandomStart, "random_start", options["random_start"])
     if options["randomize"]:
         worn = dynamics.nominal.replace(rotor_effectiveness=drone.rotor_effectiveness)
-        drawn = DroneRandomization(options["randomize"], worn, dynamics.plant_fields)
+        drawn = any_drone(options["randomize"], drone)
+        drawn = drawn or DroneRandomization(options["randomize"], worn, dynamics.plant_fields)
         chosen["randomize"] = drawn
         for params in drawn.liveliest(dynamics.nominal):
             check_flown(dynamics, params, "randomize: a ")

@@ -62,8 +62,12 @@ class ControlStep:
         action = torch.where(valid.unsqueeze(1), action, self.dynamics.hover_action)
         if "action_queue" not in state:
             return state, action, valid
-        queue = state["action_queue"]
-        return {**state, "action_queue": torch.cat((queue[:, 1:], action.unsqueeze(1)), 1)}, queue[:, 0], valid
+        queue, applied = state["action_queue"], state["action_queue"][:, 0]
+        if "delay" in state:  # of each drone, at most the length of the queue
+            places = torch.arange(self.env.action_delay, -1, -1, device=action.device)
+            drawn = (places == state["delay"]).to(action.dtype).unsqueeze(-1)
+            applied = (torch.cat((queue, action.unsqueeze(1)), 1) * drawn).sum(1)
+        return {**state, "action_queue": torch.cat((queue[:, 1:], action.unsqueeze(1)), 1)}, applied, valid
 
     def judge(self, before: State, drone: State, valid: Tensor, noise: dict[str, Tensor]) -> Transition:
         """Where the step leads, from the state at its start and where the drone has flown."""

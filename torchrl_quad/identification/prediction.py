@@ -247,8 +247,9 @@ class Windows:
             speed = rotors.follow(speed, target, self.dt)
         return torch.stack([*speeds, speed], 1)
 
-    def push(self, plant: Plant, speed: Tensor) -> Push:
-        """What the drone moved beyond the model, on average, in the samples before the windows."""
+    def push(self, plant: Plant, speed: Tensor, wind: Callable[[RigidBodyState], Tensor] | None = None) -> Push:
+        """What the drone moved beyond the model, on average, in the samples before the windows, in still air or in the
+        ``wind`` [m/s], world frame, that is a function of the state."""
         if not self.past:
             zero = self.motion.new_zeros(len(self), 3)
             return Push(zero, zero)
@@ -256,7 +257,8 @@ class Windows:
         middle = RigidBodyState(*(0.5 * (x[:, 1:] + x[:, :-1]) for x in seen))
         middle = middle._replace(quaternion=quaternion.normalize(middle.quaternion))
         turning = 0.5 * (speed[:, 1 : self.past + 1] + speed[:, : self.past])
-        linear, angular = accelerations(middle, Rotors(plant.params).wrench(turning), plant.params)
+        air = None if wind is None else wind(middle)
+        linear, angular = accelerations(middle, Rotors(plant.params).wrench(turning), plant.params, air)
         sped = seen.velocity.diff(dim=1) / self.dt - linear
         spun = seen.angular_velocity.diff(dim=1) / self.dt - angular
         return Push(quaternion.rotate_inverse(middle.quaternion, sped).mean(1), spun.mean(1))

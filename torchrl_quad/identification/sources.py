@@ -18,9 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_quad.identification.autopilots import read_ulog, read_usd
+from torchrl_quad.identification.autopilots import HEAD, read_dataflash, read_ulog, read_usd
 from torchrl_quad.identification.bags import MAGIC, read_bag
-from torchrl_quad.identification.dataflash import HEAD, read_dataflash
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog
 from torchrl_quad.identification.layouts import LAYOUTS, NEEDED, Asked, Layout, blackbox, choose, listed, match
 from torchrl_quad.identification.signals import MAX_COLUMNS, Stream, open_plain, too_many

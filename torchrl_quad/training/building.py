@@ -104,7 +104,10 @@ def network(cfg: DictConfig, name: str, env: EnvBase | None = None) -> dict[str,
     section = cfg[name]
     scale = 1.0 if cfg.normalize else section.input_scale
     activation = getattr(nn, section.activation)
-    options = {"num_cells": list(section.num_cells), "activation": activation, "input_scale": scale}
+    options: dict[str, Any] = {"num_cells": list(section.num_cells), "activation": activation, "input_scale": scale}
+    if section.get("in_keys") is not None:  # a critic may know more than the policy, of the state
+        keys = [key if isinstance(key, str) else tuple(key) for key in section.in_keys]
+        return options | {"in_keys": keys, "input_scale": plain(section.input_scale)}
     if env is not None and "obstacle" in observed(env):  # a critic reads where it is; a policy has images of it
         options |= {"in_keys": ["observation", "obstacle"], "input_scale": [scale, 1.0]}
     return options

@@ -94,6 +94,11 @@ SETTINGS: dict[str, tuple[Any, str]] = {
     "actor.channels": (_Channels, "Of the convolutions of a visual policy: [8, 16]."),
     "actor.max_kl": (Positive | None, "How far an update, or PPO's iteration, may move the policy; null for none."),
     "actor.average": (Share | None, "The share of the iterations whose weights are averaged, as 0.1; null for none."),
+    "critic.in_keys": (
+        Annotated[list[str | list[str]], Field(min_length=1)] | None,
+        "The entries that the critic reads, such as [observation, [state, rotor_speed]].",
+    ),
+    "critic.input_scale": (Positive | list[Positive], "What it reads is multiplied by this, or by one for each entry."),
     "critic.lmbda": (Fraction, "The lambda of the TD(lambda) targets; 0.95 is usual."),
     "critic.updates": (Annotated[int, Field(ge=1, le=100_000)], "Gradient steps of the critic per iteration."),
     "critic.batch_size": (Size, "Control steps in a minibatch of the critic."),
@@ -111,6 +116,7 @@ SETTINGS: dict[str, tuple[Any, str]] = {
     "checkpoint": (str, ""),
     "episodes": (Size, "Fresh episodes to fly, side by side."),
     "folder": (str | None, "The folder to write."),
+    "target": (Literal["crazyflie", "px4", "betaflight"] | None, "The firmware to write code for."),
     "logs": (Annotated[list[str], Field(min_length=1)], "The paths of flights of one drone, in a list."),
     "columns": (str | dict[str, Any] | None, "Which columns of the logs are which quantity, as for read_log."),
     "convention": (
@@ -122,10 +128,14 @@ SETTINGS: dict[str, tuple[Any, str]] = {
     "known": (dict[str, Any] | None, "Fields of the drone that are known by measurement."),
     "fields": (list[str] | None, "What to fit; null for everything."),
     "past": (NonNegative, ""),
+    "motor_command": (dict[str, float] | None, "From motor commands to rotor speeds, as in a drone's file."),
+    "max_kl": (Positive, "How far the policy may move, as a KL divergence from the one that flew."),
+    "steps": (Size, "Gradient steps of the policy."),
     "iterations": (Size, ""),
     "draws": (Count, "Of the bootstrap over windows; 0 for none."),
 }
-PROGRAMS = {"logs": "identify", "folder": "export", "checkpoint": "evaluate"}  # by a setting that only they have
+# By a setting that only they have, and those above them.
+PROGRAMS = {"motor_command": "adapt", "logs": "identify", "folder": "export", "checkpoint": "evaluate"}
 IDENTIFYING = {"horizon": (Positive, ""), "folder": (str, "The folder to write.")}  # of identify.py, under these names
 #: The options of TorchRL's ClipPPOLoss that the recipe takes.
 PPO: dict[str, tuple[Any, str]] = {

@@ -35,8 +35,32 @@ def test_a_gate_is_passed_in_its_direction_and_within_its_opening_only():
         expected = [who in ("all", kind) for _, who in ways.values()]
         assert ends["state", "gate_passed"].flatten().tolist() == expected
         assert ends["state", "gate"].flatten().tolist() == [int(x) for x in expected]
+        crosses = [x == -0.1 for x, _, _ in ways]
+        pays = [1 if passed else -1 if crossed else 0 for passed, crossed in zip(expected, crosses, strict=True)]
+        assert ends["reward_terms", "gate"].flatten().sign().tolist() == pays
     _, ends = one_step({"gates": BOTH_WAYS[::-1], **OPEN}, position, velocity)  # the same place from the other side
     assert ends["state", "gate_passed"].flatten().tolist() == [sign < 0 for sign, _ in ways.values()]
+
+
+def test_the_reward_of_a_gate_with_a_direction_is_how_fast_the_way_around_into_it_gets_shorter():
+    env = RacingEnv(num_envs=40, track={"gates": BOTH_WAYS, **OPEN}, dtype=torch.float64, seed=1)
+    generator = torch.Generator().manual_seed(0)
+    state = dict(env.reset()["state"].items())
+    off, velocity = 4.0 * torch.randn(2, 40, 3, generator=generator, dtype=torch.float64)
+    state |= {"position": state["target"] + off, "velocity": velocity}
+
+    def way(position):
+        led, _, _ = env.lead({**state, "position": position})
+        return (led["position"] - led["target"]).norm(dim=-1) - led["target"][:, 0]
+
+    step = 1e-6 * velocity
+    shorter = (way(state["position"] - step) - way(state["position"] + step)) / 2e-6
+    found = env.reward_terms(state)["towards"][:, 0] / 0.02
+    torch.testing.assert_close(found, shorter.clamp_max(15.0), rtol=1e-5, atol=1e-5)
+    assert 5 < (env.lead(state)[0]["position"][:, 0] > 0).sum() < 35  # beyond the gate
+    ahead = forward(env.rotations)[state["gate"][:, 0]]
+    still = {**state, "position": state["target"] + 0.3 * ahead, "velocity": -ahead}
+    assert (env.reward_terms(still)["towards"] > 0.0).all()  # beyond a missed gate the reward leads back
 
 
 def test_touching_a_frame_is_a_crash_from_wherever_it_comes():
@@ -136,8 +160,15 @@ def test_tracks_of_other_projects_are_read_and_what_was_assumed_is_said(tmp_path
     assert (level["gates"][0]["width"], level["frame"], level["closed"]) == (0.4, 0.16, False)
     assert level["position_jitter"] == [0.1, 0.2, 0.0] and level["box"][1] == [2.5, 1.5, 2.0]
     assert level["scene"]["cylinders"][0]["low"] == [0.9, 0.65, 0.0]
-    env = RacingEnv(num_envs=2, track=tmp_path / "level.toml", drone="crazyflie", first_gate=0)
-    assert not env.is_crash(env.reset()["state"]).any() and env.scene.touchable is not None
+    (tmp_path / "any.toml").write_text(LSY.replace("false", "true"))
+    drawn = load_track(tmp_path / "any.toml", random={"gates": 4})
+    for track in (drawn, tmp_path / "level.toml"):
+        env = RacingEnv(num_envs=8, track=track, drone="crazyflie", first_gate=0, observe_directions=True)
+        td = env.reset()
+        flight = fly(env, td, hold(env, 20))["next"]
+        assert not flight["crash"].any() and len(td["state", "track", "gates"].unique(dim=0)) == 8
+        assert (flight["state", "track"] == td["state", "track"].unsqueeze(1)).all()
+    assert len(td["state", "scene", "cylinders"].unique(dim=0)) == 8 and env.scene.touchable is not None
     assert forward(env.rotations)[0].tolist() == pytest.approx([math.cos(0.78), -math.sin(0.78), 0.0], abs=1e-6)
     lap = load_track({**POINTS, "gates": [[0, 0, 1], [4, 0, 1], [4, 4, 1], [0, 0, 1]]})
     assert not lap["closed"] and len(lap["gates"]) == 5

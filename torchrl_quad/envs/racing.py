@@ -29,7 +29,8 @@ RELAXATION_WEIGHTS = {"log": {"gate": 5.0}, "reciprocal": {"gate": 1.0}}
 GATES, ROTATIONS = ("track", "gates"), ("track", "rotations")  # in the state, where each episode has another track
 FirstGate = Annotated[int, between(0, 999)]
 START_ROOM = 0.05  # [m], to the sides of the box, at least
-RETURN = 2.0  # [m], before a gate, where drones are led that are beyond it
+FUNNEL = 0.5  # how far before a gate the reward leads, as a share of the way to the axis of the gate
+ROUND = 0.1  # [m], from the axis, where the way to it is rounded off
 SAMPLES = 8  # of the way of a step, on which it may touch the frame of a gate
 
 
@@ -43,6 +44,7 @@ class RacingEnv(QuadrotorEnv):
     gate after that - position                  3     m, world frame
     10 direction of the next gate               3     world frame; with ``observe_directions``
     10 direction of the gate after that         3     world frame; with ``observe_directions``
+    10 way to the planes of these two gates     2     m, at most 1 to both sides; with ``observe_directions``
     10 quaternion                               4     (w, x, y, z), body to world
     velocity                                    3     m/s, world frame
     angular velocity                            3     rad/s, body frame
@@ -50,10 +52,13 @@ class RacingEnv(QuadrotorEnv):
 
     Reward "velocity": 0.02 min(v_t, 15) - 0.02 |v_a| / (d + 1) - 0.001 |w|, and a gate bonus of 5, where v_t is the
     velocity towards the next gate, v_a the part of the velocity across that direction, and d the distance to the gate
-    [m]. Reward "position": that of hovering, with the next gate as its target, and a gate bonus of 20. The binary bonus
-    is paid in the step that passes a gate and carries no gradient; with ``event_discount`` the time at which the drone
-    enters the gate's sphere, or crosses its plane, does. Two relaxations replace the bonus by one in each step: "log",
-    -5 log(d + 0.01), and "reciprocal", 1 / (d + 0.05).
+    [m]. Reward "position": that of hovering, with the next gate as its target, and a gate bonus of 20. Where gates have
+    a direction, d and v_a are about a point on the axis of the gate, before it by half of the drone's distance from the
+    axis, and by the drone's way beyond the gate; v_t is how fast the way over that point gets shorter. A step that
+    crosses the plane of such a gate elsewhere takes up to a bonus away, tanh(m) of it at m [m] from half of the
+    opening. The binary bonus is paid in the step that passes a gate and carries no gradient; with ``event_discount``
+    the time at which the drone enters the gate's sphere, or crosses its plane, does. Two relaxations replace the bonus
+    by one in each step: "log", -5 log(d + 0.01), and "reciprocal", 1 / (d + 0.05).
 
     A gate that is a point is passed when the straight line that the drone flew in a control step comes within 0.3 m of
     it. A gate with a direction is passed when that line crosses its plane, from behind, within its opening. The reward
@@ -253,9 +258,8 @@ class RacingEnv(QuadrotorEnv):
         start, end = self.local(previous, state)
         behind, beyond = start[:, :1], end[:, :1]
         off = torch.lerp(start, end, -behind / (beyond - behind).clamp_min(1e-12))[:, 1:]
-        opening = self.openings[previous["gate"][:, 0]]
-        off = terms.norm(off) if opening.shape[-1] == 1 else off.abs()
-        return (behind < 0.0) & (beyond >= 0.0) & (off < opening).all(-1, keepdim=True)
+        off = _outside(off, self.openings[previous["gate"][:, 0]])
+        return (behind < 0.0) & (beyond >= 0.0) & (off < 0.0).all(-1, keepdim=True)
 
     def touches(self, previous: State, state: State) -> Tensor:
         """Whether a step touches the frame of any gate, (n, 1): bars around the opening, as deep as they are wide.
@@ -269,8 +273,7 @@ class RacingEnv(QuadrotorEnv):
         crossing = (-start[..., :1] / torch.where(way[..., :1] == 0.0, 1.0, way[..., :1])).clamp(0.0, 1.0)
         share = torch.cat((share + 0.0 * crossing, crossing), -1).unsqueeze(-1)  # (n, k, instants, 1)
         along, aside = (start.unsqueeze(2) + share * way.unsqueeze(2)).split((1, 2), -1)
-        aside = terms.norm(aside) if self.openings.shape[-1] == 1 else aside.abs()
-        beyond = aside - self.openings.unsqueeze(1)  # the edges of the opening
+        beyond = _outside(aside, self.openings.unsqueeze(1))
         bars = torch.maximum(_box(beyond - self.frame), -beyond.amax(-1, keepdim=True))
         distance = _box(torch.cat((bars, along.abs() - 0.5 * self.frame), -1))
         return (distance < self.drone_radius).flatten(1).any(1, keepdim=True)
@@ -322,31 +325,42 @@ class RacingEnv(QuadrotorEnv):
         poses = [self.pose(state, k % len(self.gates)) for k in (gate, gate + 1)]
         parts = [centre - state["position"] for centre, _ in poses]
         if self.observe_directions:
-            parts += [10.0 * forward(rotation) for _, rotation in poses]
+            ahead = [forward(rotation) for _, rotation in poses]
+            left = [
+                (gap * along).sum(-1, keepdim=True).clamp(-1.0, 1.0) for gap, along in zip(parts, ahead, strict=True)
+            ]
+            parts += [10.0 * x for x in (*ahead, *left)]
         return torch.cat((*parts, *terms.body_observation(state)), -1)
 
     def observation_bounds(self) -> Tensor:
         width, depth = (2.0 * self.half_width).tolist()  # from one side of the box to the other
-        directions = 6 * (10.0,) if self.observe_directions else ()
+        directions = 8 * (10.0,) if self.observe_directions else ()
         return self.tensor((*2 * (width, depth, self.ceiling - self.floor), *directions, *terms.BODY_BOUNDS))
 
-    def aim(self, state: State) -> Tensor:
-        """What the reward leads to, (n, 3) [m]: the next gate, or a point before it for a drone that is beyond it.
+    def lead(self, state: State) -> tuple[State, Tensor, Tensor]:
+        """Where the reward leads, to a gate with a direction: the state in the frame of that gate, x in its direction.
 
-        At the gate itself no way on would be rewarded to a drone that has missed it.
+        The target is a point on its axis, before it by half of the way to the axis, and farther for a drone that is
+        beyond it: at the gate itself no way back would be rewarded. Then how fast that grows, (n, 1) [m/s]; and from 0
+        to 1 by how far a drone passes the gate that has just crossed its plane, (n, 1).
         """
-        if not self.is_directed:
-            return state["target"]
-        ahead = forward(self.pose(state, state["gate"])[1])
-        beyond, speed = (
-            (x * ahead).sum(-1, keepdim=True) for x in (state["position"] - state["target"], state["velocity"])
-        )
-        # Who has crossed the plane in this step is about to pass the gate; the step's terms before that ask, too.
-        is_beyond = beyond > 2.0 * self.control_dt * speed.clamp_min(0.0)
-        return torch.where(is_beyond, state["target"] - RETURN * ahead, state["target"])
+        rotation, gap = self.pose(state, state["gate"])[1], state["position"] - state["target"]
+        place, velocity = (quaternion.rotate_inverse(rotation, x) for x in (gap, state["velocity"]))
+        along, aside, speed = place[:, :1], place[:, 1:], velocity[:, :1]
+        off = (aside.square().sum(-1, keepdim=True) + ROUND**2).sqrt()
+        beyond = along - 2.0 * self.control_dt * speed.clamp_min(0.0)  # not in the step that crosses the plane
+        before = FUNNEL * (off - ROUND) + beyond.clamp_min(0.0)
+        growth = FUNNEL * (aside * velocity[:, 1:]).sum(-1, keepdim=True) / off + torch.where(beyond > 0.0, speed, 0.0)
+        outside = _outside(aside, 0.5 * self.openings[state["gate"][:, 0]]).amax(-1, keepdim=True).clamp_min(0.0)
+        missed = torch.where((along >= 0.0) & (along < self.control_dt * speed), outside.tanh(), 0.0)
+        return {**state, "position": place, "velocity": velocity, "target": pad(-before, (0, 2))}, growth, missed
 
     def reward_terms(self, state: State) -> State:
-        state = {**state, "target": self.aim(state)}
+        bonus = state["gate_passed"].to(self.dtype)
+        growth = None
+        if self.is_directed:
+            state, growth, missed = self.lead(state)
+            bonus = bonus - missed
         gap = terms.distance(state)
         if self.reward == "position":
             rewards = terms.target_reward(state, self.weights)
@@ -354,12 +368,13 @@ class RacingEnv(QuadrotorEnv):
             direction = (state["target"] - state["position"]) / gap.clamp_min(1e-6)
             towards = (state["velocity"] * direction).sum(-1, keepdim=True)
             across = terms.norm(state["velocity"] - towards * direction)
+            if growth is not None:  # along the way over that point, which moves
+                towards = towards - growth * (1.0 - direction[:, :1])
             rewards = {
                 "towards": self.weights["towards"] * towards.clamp_max(self.max_rewarded_speed),
                 "across": -self.weights["across"] * across / (gap + 1.0),
                 "angular_velocity": -self.weights["angular_velocity"] * terms.norm(state["angular_velocity"]),
             }
-        bonus = state["gate_passed"].to(self.dtype)
         if self.gate_bonus != "binary":
             bonus = -torch.log(gap + 0.01) if self.gate_bonus == "log" else 1.0 / (gap + 0.05)
         return {**rewards, "gate": self.weights["gate"] * bonus}
@@ -404,6 +419,11 @@ class RacingEnv(QuadrotorEnv):
 
 def _metres(point: Tensor) -> list[float]:
     return point.double().round(decimals=3).tolist()
+
+
+def _outside(aside: Tensor, opening: Tensor) -> Tensor:
+    """How far places (*, 2) in the plane of a gate are beyond the edges of its opening (*, 1 or 2)."""
+    return (terms.norm(aside) if opening.shape[-1] == 1 else aside.abs()) - opening
 
 
 def _box(beyond: Tensor) -> Tensor:

@@ -80,10 +80,7 @@ class Gate:
             raise UserValueError("give a yaw, and a pitch if wanted, or a rotation (w, x, y, z), not both.")
         if self.rotation is not None and abs(math.hypot(*self.rotation) - 1.0) > 0.01:
             raise UserValueError(f"its rotation must be a unit quaternion (w, x, y, z); got {shown(self.rotation)}.")
-        if [x is None for x in (self.width, self.height, self.radius)] not in (
-            [False, False, True],
-            [True, True, False],
-        ):
+        if {name for name in _OPENING if getattr(self, name) is not None} not in ({"width", "height"}, {"radius"}):
             raise UserValueError(
                 "how far it is open is not said. Give width and height, or radius [m], once for the track or for each "
                 "gate: load_track(..., width=1.5, height=1.5)."
@@ -202,33 +199,14 @@ def load_track(track: str | Path | Mapping = "visfly", **settings: Any) -> dict[
         if len(found["box"]) != 2 or not all(a < b for a, b in zip(*found["box"], strict=True)):
             raise UserValueError(f"{source}: box must be its lowest and its highest corner, [x, y, z] each.")
     if "random" in values:
-        course = build(Course, f"{source}: random", values["random"] or {})
-        if "box" in found:
-            sides = np.abs(found["box"])[:, :2] - np.array(found.get("position_jitter", (0.0, 0.0, 0.0)))[:2]
-            reach = min(course.reach, max(0.0, float(sides.min())))
-            course = build(Course, f"{source}: random", {**asdict(course), "reach": reach})
-        if min(course.heights) <= floor:
-            raise UserValueError(
-                f"{source}: random: heights must be above the floor at {floor:g} m; got {shown(course.heights)}."
-            )
+        course = _course(source, values["random"] or {}, found, floor)
         found |= {**shape, "random": asdict(course)}
         zeros = course.draw(1, lambda *size: torch.zeros(size, dtype=torch.float64))
         raw = zeros[0][0].tolist() if "gate_radius" in found else _gates(*zeros)
-    is_directed = isinstance(raw, Sequence) and any(isinstance(gate, Mapping) for gate in raw)
-    if is_directed:
-        if not all(isinstance(gate, Mapping) for gate in raw):
-            raise UserValueError(f"{source}: gates must be all points, or all mappings with a position and a yaw.")
-        if "gate_radius" in found:
-            raise UserValueError(
-                f"{source}: gate_radius is of gates that are points; these have a direction. Give radius, or width and "
-                "height."
-            )
-        raw = [{k: x.tolist() if isinstance(x, Tensor | np.ndarray) else x for k, x in gate.items()} for gate in raw]
-        own = [gate if set(gate) & set(_OPENING) else {**gate, **shape} for gate in raw]
-        found["gates"] = [build(Gate, f"{source}: gate {i}", gate).entries() for i, gate in enumerate(own, 1)]
-        if len({"radius" in gate for gate in found["gates"]}) > 1:
-            raise UserValueError(f"{source}: all gates have a width and a height, or all have a radius.")
-        raw = [gate["position"] for gate in found["gates"]]
+    directed = None
+    if any(isinstance(gate, Mapping) for gate in _rows(raw)):
+        directed = _directed(source, _rows(raw), shape, "gate_radius" in found)
+        raw = [gate["position"] for gate in directed]
     elif extra := [key for key in (*shape, "frame", "rotation_jitter") if key in {**shape, **found}]:
         raise UserValueError(
             f"{source}: {extra[0]} is of gates with a direction; these are points, with a gate_radius."
@@ -236,11 +214,12 @@ def load_track(track: str | Path | Mapping = "visfly", **settings: Any) -> dict[
     gates = _points(source, "gates", raw, floor)
     if not 2 <= len(gates) <= MAX_GATES:
         raise UserValueError(f"{source}: a track has 2 to {MAX_GATES} gates, got {len(gates)}.")
-    if is_directed:
-        found["gates"] = [{**gate, "position": point} for gate, point in zip(found["gates"], gates, strict=True)]
+    turned = None
+    if directed:
+        found["gates"] = [{**gate, "position": point} for gate, point in zip(directed, gates, strict=True)]
+        turned = torch.tensor([gate["rotation"] for gate in directed], dtype=torch.float64)
     else:
         found |= {"gates": gates, "gate_radius": float(found.get("gate_radius", 0.3))}
-    turned = torch.tensor([gate["rotation"] for gate in found["gates"]], dtype=torch.float64) if is_directed else None
     usual = starts_before(torch.tensor(gates, dtype=torch.float64), turned, floor).tolist()
     found["starts"] = _points(source, "starts", values.get("starts", usual), floor)
     if (given := len(found["starts"])) != len(gates):
@@ -311,6 +290,34 @@ def starts_before(gates: Tensor, rotations: Tensor | None, floor: float) -> Tens
 def forward(rotations: Tensor) -> Tensor:
     """The direction (*, 3) in which gates with these rotations (*, 4) are flown."""
     return quaternion.rotate(rotations, 0.0 * rotations[..., 1:] + rotations.new_tensor([1.0, 0.0, 0.0]))
+
+
+def _course(source: str, rules: Any, found: Mapping[str, Any], floor: float) -> Course:
+    """The rules of a random track, inside its box."""
+    course = build(Course, f"{source}: random", rules)
+    if "box" in found:
+        sides = np.abs(found["box"])[:, :2] - np.array(found.get("position_jitter", (0.0, 0.0, 0.0)))[:2]
+        reach = min(course.reach, max(0.0, float(sides.min())))
+        course = build(Course, f"{source}: random", {**asdict(course), "reach": reach})
+    if min(course.heights) <= floor:
+        got = shown(course.heights)
+        raise UserValueError(f"{source}: random: heights must be above the floor at {floor:g} m; got {got}.")
+    return course
+
+
+def _directed(source: str, raw: Sequence[Any], shape: Mapping[str, Any], has_radius: bool) -> list[dict[str, Any]]:
+    """Gates with a direction, those that do not say how far they are open as far as all."""
+    if not all(isinstance(gate, Mapping) for gate in raw):
+        raise UserValueError(f"{source}: gates must be all points, or all mappings with a position and a yaw.")
+    if has_radius:
+        mend = "Give radius, or width and height."
+        raise UserValueError(f"{source}: gate_radius is of gates that are points; these have a direction. {mend}")
+    raw = [{k: x.tolist() if isinstance(x, Tensor | np.ndarray) else x for k, x in gate.items()} for gate in raw]
+    own = [gate if set(gate) & set(_OPENING) else {**gate, **shape} for gate in raw]
+    gates = [build(Gate, f"{source}: gate {i}", gate).entries() for i, gate in enumerate(own, 1)]
+    if len({"radius" in gate for gate in gates}) > 1:
+        raise UserValueError(f"{source}: all gates have a width and a height, or all have a radius.")
+    return gates
 
 
 def _rows(gates: Any) -> Sequence[Any]:

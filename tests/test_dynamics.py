@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import torch
 from flying import FLOWN
+from refusals import cases
 from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 
 from torchrl_quad import HoveringEnv
 from torchrl_quad.deploy.simulators import vehicle
-from torchrl_quad.dynamics import FlightController, Quadrotor, load_drone, quaternion, rigid_body
+from torchrl_quad.dynamics import Betaflight, FlightController, Quadrotor, load_drone, quaternion, rigid_body
 from torchrl_quad.dynamics.control import Setpoint
 from torchrl_quad.dynamics.gains import rate_loop
 from torchrl_quad.dynamics.model import QuadrotorState
@@ -252,12 +253,13 @@ def test_rotations_agree_with_the_rotation_matrix_and_invert_each_other():
     torch.testing.assert_close(quaternion.rotate(quaternion.multiply(p, q), v), one_by_one)
 
 
-@pytest.mark.parametrize("own", [False, True])
-def test_components_fly_as_tensors_do_with_two_time_constants_and_drag_above_the_centre_of_mass(own):
+@cases((Quadrotor, False), (Quadrotor, True), (Betaflight, False), (Betaflight, True))
+def test_components_fly_as_tensors_do_with_two_time_constants_and_drag_above_the_centre_of_mass(kind, own):
     params = drone(motor_time_constant=[0.03, 0.06], drag_height=0.02)
-    model = Quadrotor(params, 0.005, 1, "semi_implicit_euler")
+    model = kind(params, 0.005, 1, "semi_implicit_euler")
     state = model.rest(torch.zeros(3, 3, dtype=F64))
     state["velocity"] = vector(1.0, -2.0, 0.5).repeat(3, 1)
+    state |= {name: 0.1 + x for name, x in state.items() if name in ("rate_integral", "slow_rate")}
     action = model.hover_action + torch.tensor([[0.3, 0.2, -0.1, 0.4], [-0.3, 0.0, 0.3, 0.0], [0.0] * 4], dtype=F64)
     flies = params.replace(mass=0.5, drag_height=0.04) if own else model.nominal
     flies = flies.replace(rotor_effectiveness=[0.9, 1.0, 0.8, 1.0], rotor_direction=TILTED) if own else flies

@@ -130,6 +130,10 @@ def test_thrust_by_hand():
     assert newtons == pytest.approx(weight)
     assert frames.betaflight().thrust(2.5, 10.0) == pytest.approx(1250.0)
     assert frames.betaflight().thrust(2.5, 10.0, model_factor=1.0) == pytest.approx(1500.0)  # thrust = signal squared
+    stock = frames.betaflight(min_check=1050, motor_idle=0.055)  # half of what is left is 0.055 + 0.945 / 2
+    assert stock.thrust([0.0, 5.275, 10.0], 10.0) == pytest.approx([1050.0, 1525.0, 2000.0])
+    assert stock.newtons(1050, 10.0) == pytest.approx(0.55)
+    refuses("min_check must lie from 750 .* 0.055 for the firmware's defaults", frames.betaflight, motor_idle=5.5)
     command = frames.crazyflie().thrust(0.2, 4 * 0.15)
     assert struct.unpack("<H", struct.pack("<H", command)) == (65535 // 3,)  # as cflib sends it
     assert frames.crazyflie().thrust([0.2, 0.6], 4 * 0.15).tolist() == [65535 // 3, 60000]

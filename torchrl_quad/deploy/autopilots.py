@@ -52,13 +52,18 @@ def nominal(contract: Contract) -> Drone:
 
 
 def throttle(drone: Drone, idle: float) -> Throttle:
-    """The curve of a drone whose rotors turn at their least speed at the signal ``idle``, and faster in proportion. It
-    is exact at hover, and at full thrust unless f would leave 0 to 1."""
+    """The curve of a drone whose rotors turn at their least speed at the signal ``idle``, and faster in proportion:
+    exact at hover, and nearest (least squares) over the thrusts that a policy commands."""
     low, high = drone.rotor_speed_min, drone.rotor_speed_max
-    hover = idle + (1.0 - idle) * float((drone.hover_speed.mean() - low) / (high - low))
-    share = drone.weight / (len(drone.rotor_spin) * drone.thrust_limits[1])
-    factor = min(max((hover - share) / (hover - hover**2), 0.0), 1.0)
-    return Throttle(drone.weight / float(frames.motor_thrust(hover, factor)), factor, hover)
+    most = min(drone.max_thrust_to_weight * drone.weight, len(drone.rotor_spin) * drone.thrust_limits[1])
+    thrusts = np.linspace(0.0, most, 101)
+    speeds = np.append(drone.speed(thrusts / len(drone.rotor_spin)), drone.hover_speed.mean())
+    *signals, hover = idle + (1.0 - idle) * np.clip((speeds - low) / (high - low), 0.0, 1.0)
+    factors = np.linspace(0.0, 1.0, 1001)[:, None]
+    full = drone.weight / (factors * hover**2 + (1.0 - factors) * hover)
+    found = full * (factors * np.square(signals) + (1.0 - factors) * signals)
+    best = np.square(found - thrusts).sum(1).argmin()
+    return Throttle(float(full[best, 0]), float(factors[best, 0]), float(hover))
 
 
 def gains(drone: Drone, newtons: float | Array) -> Array:

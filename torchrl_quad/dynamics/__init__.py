@@ -10,6 +10,7 @@ from torchrl_quad.dynamics.control import (
     VelocityController,
     make_controller,
 )
+from torchrl_quad.dynamics.firmware import Betaflight
 from torchrl_quad.dynamics.gains import suggest_gains
 from torchrl_quad.dynamics.importing import import_drone, load_drone
 from torchrl_quad.dynamics.model import Dynamics, PointMass, Quadrotor, QuadrotorState
@@ -17,13 +18,18 @@ from torchrl_quad.dynamics.parameters import MotorCommand, QuadrotorParams, avai
 from torchrl_quad.dynamics.rigid_body import INTEGRATORS, RigidBodyState, accelerations
 
 #: The dynamics models by name.
-DYNAMICS: dict[str, type[Dynamics]] = {"quadrotor": Quadrotor, "point_mass": PointMass}
+DYNAMICS: dict[str, type[Dynamics]] = {
+    "quadrotor": Quadrotor,
+    "point_mass": PointMass,
+    "betaflight": Betaflight,
+}
 
 __all__ = [
     "CONTROLS",
     "DYNAMICS",
     "INTEGRATORS",
     "AttitudeController",
+    "Betaflight",
     "Dynamics",
     "FlightController",
     "MotorCommand",

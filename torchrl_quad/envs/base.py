@@ -65,6 +65,7 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         control: what an action (4) in [-1, 1] commands: "rates" (thrust, body rates), "attitude" (thrust, roll, pitch,
             yaw rate), "rotor_thrusts" (n, of n rotors), "velocity" (and yaw rate), or a mapping with limits, such as
             {mode: velocity, max_speed: 5.0}. See ``docs/actions.md``.
+        firmware: "betaflight" for the rate loop of :class:`~torchrl_quad.dynamics.Betaflight`, to train for it.
         dt: the physics step, 1e-6 to 0.1 s.
         control_dt: the control step, 1e-6 to 1 s, 1 to 200 times dt. Hovering is judged by its last second.
         action_delay: control steps from a command to its effect, 0 to 1000; 1 is usual.
@@ -106,6 +107,7 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         drone: config.DroneOption = "visfly",
         dynamics: config.DynamicsOption = "quadrotor",
         control: config.ControlOption = "rates",
+        firmware: config.FirmwareOption = None,
         dt: PhysicsStep = 0.005,
         control_dt: config.ControlPeriod = 0.02,
         action_delay: Delay = 1,
@@ -125,7 +127,8 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
     ) -> None:
         # What is built of these is built again on another device.
         self._options: dict[str, Any] = {
-            "dynamics": dynamics, "control": control, "dt": dt, "control_dt": control_dt, "integrator": integrator,
+            "dynamics": dynamics, "control": control, "firmware": firmware, "dt": dt, "control_dt": control_dt,
+            "integrator": integrator,
             "random_start": random_start, "randomize": randomize, "wind": wind, "observation_noise": observation_noise,
             "observation_delay": observation_delay, "disturbances": config.as_disturbances(disturbances),
             "scene": scene, "camera": camera,
@@ -257,9 +260,13 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         return draw_frame(self, drones, size)
 
     def rebuilt(self, **changes: Any) -> Any:
-        """The same environment with other arguments, built again: ``env.rebuilt(num_envs=8, wind=None)``."""
-        given: dict[str, Any] = {**self._built_with, "compile": self._stepper.options or self.is_compiled, **changes}
-        return type(self)(**given)
+        """The same environment with other arguments, built again: ``env.rebuilt(num_envs=8, wind=None)``. It flies the
+        same drone, from its own starts."""
+        now = {"compile": self._stepper.options or self.is_compiled, "device": self.device}
+        env = cast(Any, type(self))(**{**self._built_with, **now, **changes})
+        if self.params is not self.nominal:
+            env.set_params(self.params)
+        return env
 
     def _place(self, drone: QuadrotorParams) -> None:
         """Build what holds tensors on the device and in the precision of the environment."""

@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import AfterValidator
@@ -58,6 +58,7 @@ DroneOption = Annotated[
     Any, accepted(lambda x: isinstance(x, str | Path | Mapping | QuadrotorParams) and x != "", _DRONE)
 ]
 DynamicsOption = Annotated[Any, AfterValidator(_dynamics)]
+FirmwareOption = Literal["betaflight"] | None
 ControlOption = Annotated[
     Any, accepted(lambda x: isinstance(x, str | Mapping), "a name, such as rates, or a mapping with limits")
 ]
@@ -101,7 +102,9 @@ def as_disturbances(value: Any, setting: str = "disturbances") -> list[Disturban
 def build_dynamics(nominal: QuadrotorParams, options: Mapping[str, Any]) -> Dynamics:
     """The model of the drone; a UserValueError says which options do not fit each other."""
     dt, control_dt, control = options["dt"], options["control_dt"], options["control"]
-    model: Callable[..., Dynamics] = DYNAMICS[options["dynamics"]]
+    model: Callable[..., Dynamics] = DYNAMICS[options["firmware"] or options["dynamics"]]
+    if options["firmware"] and options["dynamics"] not in ("quadrotor", options["firmware"]):
+        raise UserValueError(f"firmware={options['firmware']!r} flies a quadrotor. Leave out dynamics=...")
     takes_control = "control" in inspect.signature(model).parameters
     if not takes_control and control != "rates":
         raise UserValueError(

@@ -40,6 +40,7 @@ class Drone:
     quadratic_drag: Array
     rate_gain: Array
     rate_damping: Array
+    max_thrust_to_weight: float
 
     def __init__(self, fields: Contract) -> None:
         arrays = {name: np.array(value, float) for name, value in fields.items()}

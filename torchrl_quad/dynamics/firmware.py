@@ -1,0 +1,91 @@
+"""The quadrotor with the rate loop and the mixer that Betaflight flies with the settings of an exported policy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from torchrl_quad.airframe import RateLoop
+from torchrl_quad.dynamics.control import FlightController, Setpoint
+from torchrl_quad.dynamics.model import Quadrotor
+from torchrl_quad.dynamics.parameters import QuadrotorParams
+from torchrl_quad.dynamics.rigid_body import gyroscopic_torque
+from torchrl_quad.dynamics.vector import Vector, cat, clamp, larger, matvec, smaller
+from torchrl_quad.errors import UserValueError
+
+INTEGRAL_SHARE = 0.1  # of the bandwidth of the loop without it, as in betaflight.txt
+RELAX_CUTOFF = 15.0  # [Hz], iterm_relax_cutoff
+RELAX_THRESHOLD = math.radians(40.0)  # [rad/s], by which a setpoint that leaves its mean stops the integral
+
+
+class FirmwareController(FlightController):
+    """A mixer that adds torques to the speeds of rotors and not to their thrusts: the loop is quicker with throttle."""
+
+    def __init__(self, nominal: QuadrotorParams) -> None:
+        super().__init__(nominal)
+        fields = ("rate_gain", "inertia", "rate_damping", "motor_time_constant")
+        gain, inertia, damping, lag = (getattr(nominal, k).detach().cpu().numpy() for k in fields)
+        bandwidth = RateLoop(gain, inertia, damping, lag, 0.0).bandwidth
+        self.integral_rate = torch.as_tensor(INTEGRAL_SHARE * bandwidth).to(self.gain)  # (3) [1/s]
+        k2, k1, _ = nominal.thrust_map.split(1, -1)
+        self.per_slope = 1.0 / (2.0 * k2 * self.hover_speed.mean(-1, keepdim=True) + k1)  # [rad/s per N]
+        self.span = nominal.rotor_speed_max - nominal.rotor_speed_min
+
+    def rotor_speed(
+        self, setpoint: Setpoint, angular_velocity: Vector, wrench: Vector, moment: Vector | None = None
+    ) -> Vector:
+        """As for the loop of training, of which it only sees the gyro. Where the torques need more than the whole range
+        they shrink, all alike; the throttle moves to make room for them (airmode)."""
+        held = gyroscopic_torque(angular_velocity, self.nominal.inertia)
+        held = held if moment is None else held - moment
+        acceleration = (wrench[..., 1:4] - held) / self.nominal.inertia
+        torque = self.gain * (setpoint.body_rate - angular_velocity) - self.nominal.rate_damping * acceleration
+        mix = matvec(self.mixer, cat(setpoint.thrust * 0.0, torque)) * self.per_slope
+        least, greatest = mix.amin(-1, keepdim=True), mix.amax(-1, keepdim=True)
+        shrink = (self.span / larger(greatest - least, self.span * 1e-6)).clamp_max(1.0)
+        low, high = self.nominal.rotor_speed_min, self.nominal.rotor_speed_max
+        throttle = self.rotors.speed(clamp(self.share * setpoint.thrust, self.thrust_min, self.thrust_max))
+        throttle = larger(smaller(throttle, high - greatest * shrink), low - least * shrink)
+        return clamp(throttle + mix * shrink, low, high)
+
+
+class Betaflight(Quadrotor):
+    """The quadrotor with the firmware's mixer, and with an integral that rests while commands move:
+    ``firmware="betaflight"``.
+
+    Entries of the state, each (3) [rad/s]: ``rate_integral``, what the integral adds to the wanted body rate, and
+    ``slow_rate``, the wanted body rate behind a low-pass filter. In a step of dt, with I = 0.1 bandwidth [1/s],
+
+    .. math:: slow \\leftarrow slow + (1 - e^{-2 \\pi 15 dt}) (wanted - slow), \\qquad
+        integral \\leftarrow integral + dt I (wanted - w) \\max(0, 1 - |wanted - slow| / 40°/s).
+
+    Source: ``pid.c`` and ``mixer.c`` of Betaflight 4.6, with ``betaflight.txt`` of an exported policy.
+
+    Raises:
+        ValueError: actions command something else than body rates.
+    """
+
+    sizes = {**Quadrotor.sizes, "rate_integral": 3, "slow_rate": 3}
+
+    def finish(self) -> None:
+        """Refuse other controllers than that of body rates, whose place the firmware's takes."""
+        super().finish()
+        if type(self.controller) is not FlightController:
+            raise UserValueError('firmware="betaflight" flies body rates. Leave out control=..., or firmware.')
+        self.controller = FirmwareController(self.nominal)
+        self.slowing = 1.0 - math.exp(-2.0 * math.pi * RELAX_CUTOFF * self.dt)
+
+    def physics_step(
+        self, state: Sequence[Vector], setpoint: Any, plant: Any, controller: Any, wind: Vector | None
+    ) -> Any:
+        """The quadrotor's step, for a wanted body rate to which the integral adds."""
+        *drone, integral, slow = state
+        wanted = setpoint.body_rate
+        after = super().physics_step(drone, Setpoint(setpoint.thrust, wanted + integral), plant, controller, wind)
+        slow = slow + (wanted - slow) * self.slowing
+        relaxed = ((wanted - slow).abs() * (-1.0 / RELAX_THRESHOLD) + 1.0).clamp_min(0.0)
+        integral = integral + controller.integral_rate * (wanted - drone[3]) * relaxed * self.dt
+        return [*after, integral, slow]

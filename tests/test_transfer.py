@@ -158,17 +158,19 @@ def test_a_policy_with_eyes_sees_in_mujoco_what_it_sees_in_ours(export_once, mon
     folder = export_once("hovering, without memory")[2]  # among no trees; each image for two steps, three steps late
     bundle = load_bundle(folder)
     ours = fly(bundle, "torchrl_quad")
-    for name, total in (("position_error", np.median), ("crash", np.mean)):
-        assert total(ours["metrics"][name]) == pytest.approx(bundle.contract["results"][name], rel=1e-3)
+    error, results = np.quantile(ours["metrics"]["position_error"], 0.5, method="lower"), bundle.contract["results"]
+    assert error == pytest.approx(results["position_error"], rel=1e-4)
+    assert ours["metrics"]["crash"].mean() == results["crash"]
     bundle = load_bundle(export_once("forest")[2])
     ours, theirs = (fly(bundle, name, episodes=8) for name in ("torchrl_quad", "mujoco"))
     assert theirs["faults"] == {} and ours["metrics"]["crash"].sum() > 0
-    np.testing.assert_allclose(theirs["action"], ours["action"], atol=0.05)
+    gap = np.abs(theirs["action"] - ours["action"]).max()
+    assert gap < 0.01
     for name in ("crash", "distance", "clearance"):
         np.testing.assert_allclose(theirs["metrics"][name], ours["metrics"][name], atol=0.05)
     bundle._starts["scene.cylinders"][..., 0] += 500.0
     blind = fly(bundle, "mujoco", episodes=8)
-    assert np.abs(blind["action"] - theirs["action"]).max() > 0.2
+    assert np.abs(blind["action"] - theirs["action"]).max() > 2.0 * gap
     monkeypatch.setattr(MuJoCo, "sees", False)
     refuses(
         "mujoco has no camera, and this policy reads images. Fly it in", fly, bundle, "mujoco", error=UserValueError

@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from string import Template
 
+from torchrl_quad.deploy import autopilots
 from torchrl_quad.deploy.bundle import load_bundle
 from torchrl_quad.deploy.network import as_float, as_floats, fill_in
 from torchrl_quad.deploy.simulators.vehicle import Drone
@@ -50,18 +51,22 @@ def write_target(folder: str | Path, target: str) -> Path:
             f'target={target}: the code is for control="rates" from what a drone measures; this policy commands '
             f"{output['control']}{' and reads ' + wrong[0] if wrong else ''}. Call policy.c from code of your own."
         )
-    full = len(contract["drone"]["rotor_spin"]) * float(Drone(contract["drone"]).thrust_limits[1])
-    most = [high for _, high in output["body_rate"]["range"]]
+    drone = Drone(contract["drone"])
+    idle = autopilots.idle(drone)
+    curve = autopilots.throttle(drone, idle)
     aims = contract["task"]["name"] in AIMED and contract["observation"]["size"] == 13
     values = {
         "task": contract["task"]["name"],
         "target": as_floats(bundle.starts()["target"][0]) if aims else "",
         "memory": " pilot->memory," if contract["memory"] else "",
-        "full_thrust": as_float(full),
+        "full_thrust": as_float(len(drone.rotor_spin) * drone.thrust_limits[1]),
+        "full_curve": as_float(curve.full_thrust),
+        "curve": as_float(curve.model_factor),
+        "idle": as_float(idle),
+        "min_check": as_float(autopilots.MIN_CHECK),
         "weight": as_float(output["thrust"]["weight"]),
         "period": round(1000 * contract["control_dt"]),
-        "max_rates": as_floats(most),
-        "stick": ", ".join(f"{math.degrees(x):g}" for x in most),
+        "stick": as_float(math.radians(autopilots.stick_rate(contract))),
         "stack": STACK,
     }
     features = ["aims" if aims else "yours", *(["memory"] if contract["memory"] else [])]

@@ -16,6 +16,7 @@ from torch.linalg import vector_norm
 
 from torchrl_quad.airframe import RateLoop
 from torchrl_quad.data.unwrap import leaf
+from torchrl_quad.deploy import autopilots
 from torchrl_quad.deploy.contract import GRAPHS, MEASURED, Contract, Fields, schema_table
 from torchrl_quad.deploy.network import fill_in
 from torchrl_quad.deploy.tracing import Rules
@@ -204,6 +205,11 @@ def _rate_loop(env: QuadrotorEnv, drone: Contract) -> Fields | None:
         "every simulator.dt: w += dt a and, at once, a += (1 - exp(-dt / motor_time_constant)) "
         "(gain (desired - w) - (1 + rate_damping / inertia) a)"
     )
+    if "rate_integral" in env.dynamics.sizes:
+        law += (
+            ". With desired = commanded + i; each step also l += (1 - exp(-2 pi 15 dt)) (commanded - l) and "
+            "i += dt 0.1 B (commanded - w) max(0, 1 - |commanded - l| / 40 deg/s), B being the bandwidth for dt to 0"
+        )
     return {"law": law, "gain": drone["rate_gain"], **values}
 
 
@@ -285,6 +291,7 @@ def write_page(contract: Contract, documentation: str | None) -> bytes:
         ray, axis = "the length of its ray to", "the depth, along the optical axis, of"
         values["camera_pixel"] = ray if camera["along_ray"] else axis
     features = [name for name in ("camera", "memory") if contract[name]]
+    features += ["autopilots"] if autopilots.files(contract) else []
     features += ["advance"] if "advance" in graphs else []
     features += [] if task["unjudged"] else ["judged"]
     return fill_in("README.md", values, features).encode()

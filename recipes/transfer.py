@@ -6,8 +6,9 @@ It flies one episode from each of the bundle's fresh starts with each rate loop 
 task's own rules, adds a row to ``transfer.csv`` beside the bundle, and prints them. What is there is not flown again.
 Settings:
 
-    simulator=mujoco     or rotorpy, crazyflow, torchrl_quad (our own, which needs torch)
-    loop=pid             only one rate loop: contract, pid, pd, or own, RotorPy's
+    simulator=mujoco     or rotorpy, crazyflow, betaflight (the firmware, on Linux), torchrl_quad (ours; needs torch)
+    loop=pid             only one rate loop: contract, pid, pd, or own, that of RotorPy and Betaflight; or stock,
+                         Betaflight's without the gains of betaflight.txt
     mutants=true         also fly mistakes of a port, each of which must fail
     scale={mass: 1.2}    fly another drone than the policy was told of
     late=1               control steps by which commands are later than the contract says

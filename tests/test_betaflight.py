@@ -1,8 +1,10 @@
 """An autopilot's parameters follow from the contract; Betaflight flies with them in lockstep, or says why not."""
 
 import math
+import signal
 import subprocess
 import sys
+import time
 import types
 from importlib import resources
 from pathlib import Path
@@ -11,8 +13,9 @@ import numpy as np
 import pytest
 import yaml
 from refusals import cases, refuses
+from small_runs import ROOT
 
-from torchrl_quad.deploy import autopilots, frames
+from torchrl_quad.deploy import autopilots, frames, load_bundle
 from torchrl_quad.deploy.simulators import make_simulator
 from torchrl_quad.errors import UserError
 
@@ -162,3 +165,68 @@ def test_it_fails_loudly_and_leaves_no_process(changes, said, module, monkeypatc
     assert len(pids) == 2 and (world.state()["velocity"][:, 2] > 0.0).all()  # half of the signal is more than hover
     del world
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
+
+
+def test_a_bundle_holds_what_is_flown(export_once):
+    bundle = load_bundle(export_once("racing")[2])
+    found = {name: (bundle.folder / name).read_text() for name in autopilots.AUTOPILOTS}
+    assert found == autopilots.files(bundle.contract)
+    assert "`betaflight.txt`" in (bundle.folder / "README.md").read_text()
+
+
+def flown(simulator, loop="contract", dynamics="betaflight"):
+    """Body rates (75, 3, 3), in units of the greatest, after random commands."""
+    about, draw = contract(), np.random.default_rng(0)
+    about["simulator"]["dynamics"], most, n = dynamics, np.array(about["drone"]["max_body_rate"]), 3
+    commands = most * np.tanh(np.cumsum(0.15 * draw.standard_normal((75, n, 3)), 0))
+    weights = 1.6 + 1.2 * np.sin(0.2 * np.arange(75)[:, None] + np.arange(n))
+    world, found = make_simulator(simulator, about, loop), []
+    still = {name: np.zeros((n, 3)) for name in ("position", "velocity", "angular_velocity")}
+    world.reset(still | {"quaternion": np.tile(np.eye(4)[0], (n, 1))})
+    for rates, thrust in zip(commands, weights, strict=True):
+        world.step(thrust * about["drone"]["mass"] * 9.81, rates)
+        found.append(world.state()["angular_velocity"] / most)
+    return np.array(found)
+
+
+def is_running(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except FileNotFoundError:
+        return False
+
+
+INTERRUPTED = """
+from test_betaflight import flown
+print("flies", flush=True)
+while True:
+    flown("betaflight", "own")
+"""
+
+
+@pytest.mark.slow  # it builds and boots the firmware
+def test_the_firmware_answers_twice_the_same_as_our_model_of_it_and_leaves_nothing(monkeypatch, tmp_path, module):
+    try:
+        module.firmware()
+    except (UserError, TypeError) as error:
+        pytest.skip(f"no firmware is built here: {error}")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    theirs = flown("betaflight", "own")
+    np.testing.assert_array_equal(flown("betaflight", "own"), theirs)
+    model, usual = (
+        np.sqrt(np.square(flown("torchrl_quad", dynamics=x) - theirs).mean()) for x in ("betaflight", "quadrotor")
+    )
+    assert model < 0.01 < 0.03 < usual
+    kept = sorted(tmp_path.rglob("*"))
+    command = [sys.executable, "-c", INTERRUPTED]
+    with subprocess.Popen(command, cwd=ROOT / "tests", stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
+        assert process.stdout.readline() == b"flies\n"
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+        while not (pids := children.read_text().split()):
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        process.wait(60)
+    late = time.monotonic() + 10.0  # one that was just being started ends of itself, with its socket
+    while any(is_running(pid) for pid in pids) and time.monotonic() < late:
+        time.sleep(0.01)
+    assert not any(is_running(pid) for pid in pids) and sorted(tmp_path.rglob("*")) == kept

@@ -16,6 +16,7 @@ from torch.linalg import vector_norm
 
 from torchrl_quad.airframe import RateLoop
 from torchrl_quad.data.unwrap import leaf
+from torchrl_quad.deploy import autopilots
 from torchrl_quad.deploy.contract import GRAPHS, MEASURED, Contract, Fields, schema_table
 from torchrl_quad.deploy.network import fill_in
 from torchrl_quad.deploy.tracing import Rules
@@ -230,6 +231,11 @@ def _rate_loop(env: QuadrotorEnv, drone: Contract) -> Fields | None:
     )
     if type(getattr(env.dynamics, "controller", None)) not in CONTROLS.values():
         torque = inspect.cleandoc(type(env.dynamics).__doc__ or "")[:2000]
+    if "rate_integral" in env.dynamics.sizes:
+        law += (
+            ". With desired = commanded + i; each step also l += (1 - exp(-2 pi 15 dt)) (commanded - l) and "
+            "i += dt 0.1 B (commanded - w) max(0, 1 - |commanded - l| / 40 deg/s), B being the bandwidth for dt to 0"
+        )
     return {"law": law, "torque": torque, "gain": drone["rate_gain"], **values}
 
 
@@ -354,6 +360,7 @@ def write_page(contract: Contract, documentation: str | None) -> bytes:
         ray, axis = "the length of its ray to", "the depth, along the optical axis, of"
         values["camera_pixel"] = ray if camera["along_ray"] else axis
     features = [name for name in ("camera", "memory") if contract[name]]
+    features += ["autopilots"] if autopilots.files(contract) else []
     features += ["advance"] if "advance" in graphs else []
     features += [] if task["unjudged"] else ["judged"]
     return fill_in("README.md", values, features).encode()

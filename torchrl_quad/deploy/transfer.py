@@ -80,7 +80,7 @@ def fly(
     Args:
         folder: a bundle.
         simulator: one of ``torchrl_quad.deploy.simulators.SIMULATORS``.
-        loop: the rate loop: "contract", "pid", "pd", or "own", that of the simulator.
+        loop: the rate loop: "contract", "pid", "pd", or "own", that of the simulator; of Betaflight "own" or "stock".
         mutant: a mistake to make.
         scale: fields of the drone that flies, times a factor: ``{"mass": 1.2}``. The rate loop does not know of it.
         late: control steps by which commands take effect later than the contract says.

@@ -63,7 +63,7 @@ def test_wind_grows_with_height_as_far_as_the_drone_has_flown():
     assert wind_at(air.expand(3, 6), heights).tolist() == expected
 
 
-@cases(("rates", False), ("rotor_thrusts", False), ("attitude", True))
+@cases(("rates", False), ("attitude", True))
 def test_a_policy_changes_within_its_bound_and_only_for_a_greater_return(control, recurrent, log):
     env = HoveringEnv(num_envs=4, max_episode_steps=20, control=control)
     actor = make_actor(env, recurrent=recurrent)

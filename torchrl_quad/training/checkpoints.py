@@ -20,7 +20,7 @@ from torchrl_quad.dynamics import presets
 from torchrl_quad.errors import UserError, UserValueError
 from torchrl_quad.files import replacing
 from torchrl_quad.training.configuration import CONFIG, named_code, plain
-from torchrl_quad.training.schema import check
+from torchrl_quad.training.schema import check, settings
 
 FORMAT = 5  # of the content; raise it when older files can no longer be read
 MARK = b"\ntorchrl_quad checkpoint, sha256 "  # then 64 digits: the checksum of all bytes before the mark
@@ -143,13 +143,24 @@ def saved_config(path: Path, content: Mapping[str, Any], trust: Collection[str] 
             f"'trust=[{', '.join(named)}]'."
         )
     try:
-        cfg = OmegaConf.create(dict(values))
+        known = settings(str(values.get("algorithm")))
+        cfg = OmegaConf.create(_with_newer(values, known))
         check(cfg)
     except UserError as error:
         raise UserValueError(f"{source}: {error}") from error
     except OmegaConfBaseException as error:
         raise UserValueError(f"{source}: {str(error).splitlines()[0]}") from error
     return cfg
+
+
+def _with_newer(values: Mapping[str, Any], known: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration with the settings that came after it and are null, off, unless somebody sets them."""
+    off = {name: None for name, default in known.items() if default is None}
+    sections = {name: section for name, section in known.items() if isinstance(section, Mapping)}
+    return off | {
+        name: _with_newer(x, sections[name]) if name in sections and isinstance(x, Mapping) else x
+        for name, x in values.items()
+    }
 
 
 @contextlib.contextmanager

@@ -83,7 +83,7 @@ def make_simulator(
     if why := contract["task"]["unjudged"]:
         raise UserValueError(
             f"The simulators here cannot fly this bundle of the task {contract['task']['name']!r}: {why}. Fly it in "
-            "the package's own environment: python recipes/evaluate.py checkpoint=... If obstacles are why, export it again."
+            "the package's own environment: python recipes/evaluate.py checkpoint=... With obstacles, export again."
         )
     kind = simulator_class(name)
     if contract["camera"] and not kind.sees:

@@ -284,7 +284,7 @@ ARENAS: dict[tuple[str, str], Callable[..., dict[str, float]]] = {
     ("l2f", ""): in_l2f,
     **{("shipped", x): lambda pilot, n, x=x: in_ours(pilot, shipped(n, x, delay=1)) for x in SHIPPED},
     **{("shipped, no delay", x): lambda pilot, n, x=x: in_ours(pilot, shipped(n, x, delay=0)) for x in SHIPPED},
-    **{("shipped, in MuJoCo", x): functools.partial(in_mujoco, name=x) for x in SHIPPED},
+    **{("mujoco", x): functools.partial(in_mujoco, name=x) for x in SHIPPED},
 }
 POLICIES = {"large": [], "small": ["actor.num_cells=[24]", "actor.hidden_size=24"], "raptor": []}
 KEY = ("policy", "seed", "drones", "drone")

@@ -95,10 +95,11 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
     if cfg.resume is None:
         return
     overrides = [override.lstrip("+~").partition("=") for override in HydraConfig.get().overrides.task]
-    asked = {"algorithm": cfg.algorithm} | {name: OmegaConf.select(cfg, name) for name, _, _ in overrides}
+    asked: dict[str, Any] = {"algorithm": cfg.algorithm}
     for name, _, value in overrides:
         if name == "tuned" and value != "null":
             asked |= _leaves(OmegaConf.load(CONFIG / f"tuned/{value}.yaml"))
+    asked |= {name: OmegaConf.select(cfg, name) for name, _, _ in overrides}  # which come after the tuned file
     path = Path(cfg.resume)
     saved = saved_config(path, read_checkpoint(path), [*cfg.trust, *named_code(plain(cfg))])
     for key, value in asked.items():

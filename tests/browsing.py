@@ -20,10 +20,10 @@ def browser():
         pytest.skip(message)
     from playwright.sync_api import sync_playwright
 
-    webgl_on_the_cpu = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    webgl_on_the_cpu += ["--disable-gpu-rasterization", "--disable-gpu-compositing"]  # which draws the rest there quicker
+    on_the_cpu = "--use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader"  # WebGL; all else is quicker so:
+    on_the_cpu += " --disable-gpu-rasterization --disable-gpu-compositing"
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", *webgl_on_the_cpu])
+        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", *on_the_cpu.split()])
         yield browser
         browser.close()
 

@@ -26,20 +26,24 @@ CAMERA = {"width": 6, "height": 5, "pitch": 0.2, "rate": 2, "delay": 1, "noise":
 SIZES = {"num_cells": (7,), "channels": (2, 3)}
 TASKS = {  # with all that policies may read, spread over the tasks
     "hovering": {},
-    "tracking": {"curve": "lemniscate", "observe_last_action": True, "action_delay": 2},
+    "tracking": {"drone": "crazyflie", "curve": "lemniscate", "observe_last_action": True, "action_delay": 2},
     "landing": {
+        "control": "attitude",
         "observation_noise": {"position": 0.01, "attitude": 0.05},
         "observation_delay": 1,
         "randomize": {"mass": {"scale": [0.8, 1.2]}, "motor_time_constant": {"uniform": [0.02, 0.05]}},
         "wind": {"mean": [1, 0, 0], "gust": 0.5},
         "random_start": {"tilt": 0.5, "yaw": 3.0},
     },
-    "racing": {"action_delay": 0},
+    "racing": {"action_delay": 0, "control": {"mode": "velocity", "max_speed": 4.0, "max_tilt": 0.7}},
     "forest": {"camera": CAMERA, "density": 0.05, "random_start": {"tilt": 0.5, "yaw": 3.0, "velocity": 3.0}},
     "forest, blind": {"camera": {"width": 4, "height": 3}, "density": 0.01}
     | {"observe_velocity": False, "observe_last_action": True},
-    "hovering, with memory": {},
-    "hovering, without memory": {"camera": {"width": 5, "height": 4, "position": [0.1, 0, 0], "along_ray": True}},
+    "hovering, with memory": {"control": "rotor_thrusts"},
+    "hovering, without memory": {
+        "camera": {"width": 5, "height": 4, "position": [0.1, 0, 0], "along_ray": True, "rate": 2, "delay": 3}
+    }
+    | {"control": "rotor_thrusts", "drone": "typhoon_h480"},
 }
 NORMALIZED = ("tracking", "racing", "forest")
 FLOWN = ("hovering", "tracking", "racing", "landing", "forest")  # of each task one
@@ -129,7 +133,10 @@ def trace_once(export_once, monkeypatch):
         about = json.loads((folder / "contract.json").read_text())
         graphs = {name: onnx.load(folder / f"{name}.onnx") for name in about["graphs"] if name != "policy"}
         keys = {name_of(key): key for key in getattr(env, "base_env", env).task_entries}
-        rules = Rules(graphs, {name: keys[name] for name in about["task"]["entries"]}, about["task"]["unjudged"])
+        obstacles = [x for x in about["graphs"].get("judge", {"reads": {}})["reads"] if x.startswith("scene.")]
+        obstacles = {name: tuple(name.split(".")) for name in obstacles}
+        entries = {name: keys[name] for name in about["task"]["entries"]}
+        rules = Rules(graphs, entries, obstacles, about["task"]["unjudged"])
         monkeypatch.setattr(export, "trace", lambda *_: rules)
 
     return trace_once
@@ -140,9 +147,9 @@ def compiled(folder, out):
     return ctypes.CDLL(str(out))
 
 
-def run_c(library, given):
+def run_c(library, given, actions=4):
     """Actions in C for what a policy reads, by name, each (n, ...); the memory (n, m) becomes that of the next step."""
-    pointer, action = ctypes.POINTER(ctypes.c_float), np.zeros(4, np.float32)
+    pointer, action = ctypes.POINTER(ctypes.c_float), np.zeros(actions, np.float32)
     rows = []
     for i in range(len(given["observation"])):
         reads = [given[name][i].ctypes.data_as(pointer) for name in ("observation", "depth", "memory") if name in given]
@@ -154,7 +161,7 @@ def run_c(library, given):
 def by_hand(actor, observation, depth=None, memory=None):
     """The mean action and the memory after it, from the weights; torch's own recurrent cell is not TorchRL's."""
     if depth is None and memory is None:
-        return torch.tanh(actor[0].module.mlp(observation)[:, :4]), None
+        return torch.tanh(actor[0].module.mlp(observation).chunk(2, 1)[0]), None
     sight, last = actor[0][0].module, actor[0][-1].module.mlp[-1]
     if depth is None:
         x = nn.functional.elu(sight.trunk.mlp(observation))
@@ -167,4 +174,4 @@ def by_hand(actor, observation, depth=None, memory=None):
         gru = actor[0][1].gru
         memory = torch.gru_cell(x, memory, gru.weight_ih_l0, gru.weight_hh_l0, gru.bias_ih_l0, gru.bias_hh_l0)
         x = torch.cat((x, memory), 1)
-    return torch.tanh(last(x)[:, :4]), memory
+    return torch.tanh(last(x).chunk(2, 1)[0]), memory

@@ -9,10 +9,12 @@ from log_writers import OURS, write_csv
 from refusals import cases, refuses
 from small_runs import SMALL
 
+from benchmarks import adaptation as benchmark
 from torchrl_quad import GeometricController, HoveringEnv, make_actor, make_visual_actor
 from torchrl_quad.adaptation import Adapter, adapt, fit_flight, simulated_log
 from torchrl_quad.adaptation.fit import wind_at
 from torchrl_quad.dynamics import MotorCommand
+from torchrl_quad.files import read_rows
 from torchrl_quad.training.checkpoints import read_checkpoint
 
 GIVES, WIND, DT = [0.9, 0.7, 0.8, 0.85], (4.0, -2.0, 0.0), 0.01
@@ -20,7 +22,7 @@ MOTORS = MotorCommand(3500.0, 1.0)
 BRIEF = {"steps": 3, "num_envs": 4, "horizon": 8}
 
 
-def flown(gives, wind, seconds=6.0):
+def flown(gives, wind, seconds):
     """A log of a drone that swings about its target, in our own simulator."""
     steps = round(seconds / DT)
     fixed = {"dtype": torch.float64, "dt": DT, "control_dt": DT, "action_delay": 0, "max_episode_steps": 10_000}
@@ -38,7 +40,7 @@ def flown(gives, wind, seconds=6.0):
 
 @pytest.fixture(scope="module")
 def log():
-    return flown(GIVES, WIND)
+    return flown(GIVES, WIND, 4.0)
 
 
 @pytest.fixture
@@ -86,7 +88,7 @@ def short(log):
 @cases(
     (silent, "does not tell what each rotor gives"),
     (short, "no piece of the flight is"),
-    (lambda log: flown([1.0] * 4, (0.0, 0.0, 0.0), 3.0), "of what was held out"),
+    (lambda log: flown([1.0] * 4, (0.0, 0.0, 0.0), 2.0), "of what was held out"),
     ids=["silent", "short", "as expected"],
 )
 def test_a_flight_that_tells_nothing_changes_nothing_and_says_why(change, why, log, hovering):
@@ -112,7 +114,9 @@ def test_what_cannot_be_adapted_is_refused_by_name(hovering):
     refuses("reads images", Adapter, make_visual_actor(seeing, channels=[2]), seeing, MOTORS)
 
 
-def test_the_recipe_writes_a_policy_a_bundle_and_a_page_and_leaves_the_checkpoint_alone(log, launch, tmp_path):
+def test_the_recipe_writes_a_policy_a_bundle_and_a_page_and_leaves_the_checkpoint_alone(
+    log, launch, no_pictures, tmp_path
+):
     launch("bptt", *SMALL, f"hydra.run.dir={tmp_path}", "task=hovering")
     checkpoint, columns = tmp_path / "checkpoint.pt", {"t": log.time}
     for quantity in ("position", "quaternion", "velocity", "angular_velocity", "motor_command"):
@@ -128,3 +132,14 @@ def test_the_recipe_writes_a_policy_a_bundle_and_a_page_and_leaves_the_checkpoin
     assert any((x != new[name]).any() for name, x in read_checkpoint(checkpoint)["best"]["actor"].items())
     page = (folder / "report.html").read_text()
     assert "What is not covered" in page and page.count("data:image/png") == 2 and "http" not in page
+
+
+@pytest.mark.slow
+def test_the_benchmark_flies_every_policy_in_mujoco_and_flies_no_row_twice(launch, tmp_path, monkeypatch):
+    launch("bptt", *SMALL, f"hydra.run.dir={tmp_path}", "task=hovering")
+    arguments = ["", "--base", f"{tmp_path}/checkpoint.pt", "--seeds", "3", "--output", f"{tmp_path}/table.csv"]
+    monkeypatch.setattr("sys.argv", arguments)
+    for _ in range(2):
+        benchmark.main()
+        rows = read_rows(tmp_path / "table.csv")
+        assert [(row["policy"], row["seed"]) for row in rows] == [(x, "3") for x in ("base", "integral", "adapted")]

@@ -13,6 +13,7 @@ import pytest
 import torch
 from refusals import cases
 
+from torchrl_quad.deploy import export
 from torchrl_quad.files import machine, read_rows
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
@@ -45,8 +46,8 @@ def run(tmp_path, monkeypatch):
     ("memory", "--num-envs 4 --modes eager --horizon 2 --rounds 1", 1),
     pytest.param("camera", "--primitives 2 --scenes trees --images 2x4x3 --rounds 1", 1, marks=pytest.mark.slow),
     ("racing", f"--tracks visfly --steps 16 --episodes 2 --cores 1 --runs runs --overrides {SMALL}", 1),
-    ("any_drone", f"--policies small --arenas drawn cf2p --episodes 2 --overrides total_steps=16 {SMALL}", 2),
-    pytest.param("any_drone", "--policies raptor --arenas l2f cf2p --episodes 2", 2, marks=THEIRS),
+    ("any_drone", f"--policies small --drones any shipped --episodes 2 --overrides total_steps=16 {SMALL}", 15),
+    pytest.param("any_drone", "--policies raptor --drones l2f --episodes 2", 1, marks=THEIRS),
     ("time_to_solve", f"--algorithms bptt --modes eager --overrides {SMALL} total_steps=16", 1),
     ("profile_recipes", f"--algorithms bptt --iterations 2 --skip 1 --overrides {SMALL}", 1),
     pytest.param("identification", "--seeds 1 --seconds 10", 10, marks=pytest.mark.slow),  # it simulates a flight
@@ -63,7 +64,7 @@ def test_a_benchmark_writes_a_table(name, arguments, rows, run, run_here, tmp_pa
         if hasattr(module, "identify"):
             quick = functools.partial(module.identify, fields=["linear_drag"], iterations=1, draws=2)
             monkeypatch.setattr(module, "identify", quick)
-        monkeypatch.setattr(module, "STEPS", 40, raising=False)
+        monkeypatch.setattr(module, "STEPS", 4, raising=False)
         if name in ("racing", "any_drone"):
             monkeypatch.setattr(module, "run", run_here)
 
@@ -71,7 +72,10 @@ def test_a_benchmark_writes_a_table(name, arguments, rows, run, run_here, tmp_pa
 
 
 def test_the_benchmark_of_exported_policies_writes_a_table(run, monkeypatch):
+    rules, trace = [], export.trace  # which are the same with a normaliser
+
     def shorter(module):
+        monkeypatch.setattr(export, "trace", lambda *given: (rules or rules.append(trace(*given)) or rules)[0])
         monkeypatch.setattr(module, "make_env", functools.partial(module.make_env, max_episode_steps=40))
 
     rows = run("deployment", "--checkpoints racing --observations 20 --calls 2", shorter)

@@ -50,11 +50,19 @@ def test_torch_onnx_and_c_agree_and_the_contract_fits_its_schema(exported, tmp_p
         np.testing.assert_allclose(memory, after, rtol=0, atol=1e-5)
         assert vectors["memory"][0].any() < vectors["memory"][1].any() and np.abs(after - vectors["memory"]).max() > 0.1
     assert not sees or vectors["depth"].std() > 0.1
-    assert load_bundle(folder).check() <= 1e-5
+    bundle = load_bundle(folder)
+    assert bundle.check() <= 1e-5
     library = compiled(folder, tmp_path / "policy.so")
     library.policy_self_test.restype = ctypes.c_float
     assert 0.0 < library.policy_self_test() <= 1e-5
-    np.testing.assert_allclose(run_c(library, vectors), expected, rtol=0, atol=1e-5)
+    k = expected.shape[1]
+    np.testing.assert_allclose(run_c(library, vectors, k), expected, rtol=0, atol=1e-5)
+    given, command, signal = ((ctypes.c_float * k)(*x) for x in (expected[0], [], []))
+    library.policy_command(given, command)
+    np.testing.assert_allclose(command, bundle.commanded(expected[0]), rtol=1e-5, atol=1e-6)
+    if bundle.contract["output"]["control"] == "rotor_thrusts":
+        library.policy_signal(command, signal)
+        np.testing.assert_allclose(signal, bundle.command(expected[0])[1], rtol=1e-5)
     if after is None:
         return
     np.testing.assert_allclose(vectors.pop("memory"), after, rtol=0, atol=1e-5)
@@ -89,7 +97,7 @@ def test_a_bundle_flies_the_environment_as_the_actor_does(exported):
         if t % 7 == 3:
             with pytest.raises(StaleState):
                 bundle(state | {"age": 1.0})
-        thrust, rates = bundle(state | {"age": 0.001})
+        pair = bundle(state | {"age": 0.001})
         with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
             td = actor(td.set("recurrent_state", memory).set("is_init", torch.zeros(16, 1, dtype=torch.bool)))
         actions.append(td["action"])
@@ -97,8 +105,14 @@ def test_a_bundle_flies_the_environment_as_the_actor_does(exported):
             memory = td["next", "recurrent_state"]
             np.testing.assert_allclose(bundle.memory, memory[0, 0], rtol=0, atol=1e-4)
         np.testing.assert_allclose(bundle.action, td["action"][0], rtol=0, atol=2e-3)
-        command = base.dynamics.controller.setpoint(torch.from_numpy(bundle.action))
-        np.testing.assert_allclose([thrust, *rates], torch.cat(command).numpy(), rtol=1e-5, atol=1e-6)
+        controller = base.dynamics.controller
+        command = controller.decode(torch.from_numpy(bundle.action))
+        if base.control == "rotor_thrusts":
+            speed, drone = controller.command(controller.setpoint_type(command), None, None), controller.nominal
+            low, high = drone.rotor_speed_min, drone.rotor_speed_max
+            np.testing.assert_allclose(pair[1], (speed - low) / (high - low), rtol=1e-4)
+            pair = pair[0]
+        np.testing.assert_allclose(np.hstack(pair), command, rtol=1e-5, atol=1e-6)
         td = env.step_mdp(env.step(td))
     assert (torch.stack(actions).std(0) > 1e-3).any()
 
@@ -182,9 +196,9 @@ def test_c_answers_what_is_not_finite_with_the_hover_action_and_decodes_commands
         assert library.policy_action((ctypes.c_float * 13)(0.0, 0.0, float(value)), action) == 1
         assert list(action) == pytest.approx([-1 / 3, 0, 0, 0])
     assert library.policy_action((ctypes.c_float * 13)(), action) == 0
-    thrust, rates = ctypes.c_float(), (ctypes.c_float * 3)()
-    library.policy_command((ctypes.c_float * 4)(-1 / 3, 0.5, -1.0, 0.25), ctypes.byref(thrust), rates)
-    assert [thrust.value, *rates] == pytest.approx([0.46 * 9.81, 1.0, -2.0, 0.5])
+    command = (ctypes.c_float * 4)()
+    library.policy_command((ctypes.c_float * 4)(-1 / 3, 0.5, -1.0, 0.25), command)
+    assert [*command] == pytest.approx([0.46 * 9.81, 1.0, -2.0, 0.5])
 
 
 @pytest.mark.parametrize("task", ["landing", "forest"])
@@ -223,7 +237,7 @@ def test_a_contract_says_what_the_environment_is(hovering):
     low, high = about["envelope"]["low"], about["envelope"]["high"]
     assert 0 < low[2] < high[2] < 6 and about["envelope"]["max_speed"] > 0.1
     page = (hovering / "README.md").read_text()
-    assert "(action + 1) / 2 x 13.5378 N" in page and "target - position           3     m, world frame" in page
+    assert "| 0 | thrust | 0 | 13.5378 | N |" in page and "target - position           3     m, world frame" in page
 
 
 def test_the_rate_loop_of_a_contract_is_that_of_the_simulator(hovering):

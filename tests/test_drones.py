@@ -339,11 +339,7 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_th
         r"\(URDF.*\) does not say motor_time_constant \[s\]. Give .*motor_time_constant=0.03\)",
     ),
     ("x.urdf", URDF.format("cf", 4e-4), r"inertia \[kg m2\]: its products of inertia are not small, 0.0004 kg m2"),
-    (
-        "x.sdf",
-        sdf(FRAME + motors(motorConstant=2e-5)),
-        "rotors differ in motorConstant",
-    ),
+    ("x.sdf", sdf(FRAME + motors(motorConstant=2e-5)), "rotors differ in motorConstant"),
     ("x.sdf", sdf("<include><uri>model://other</uri></include>"), "includes the model 'other': put it at "),
     ("x.urdf", "<!DOCTYPE x [<!ENTITY a 'b'>]><robot>&a;</robot>", "declares entities or a type"),
     ("x.sdf", sdf(FRAME.replace("0.02<", "much<")), "expected 1 number, got 'much'"),

@@ -83,11 +83,7 @@ def test_a_real_flight_is_read_in_our_units_frames_and_orders(table):
 
 
 FAULTS = {  # a fault: what changes, the error, and what its message must name
-    "gyro in degrees": (
-        lambda t: scaled(t, GYRO, 180 / np.pi),
-        "WrongUnit",
-        "imu_gyro_x.*degrees/s. Write .*0.0174",
-    ),
+    "gyro in degrees": (lambda t: scaled(t, GYRO, 180 / np.pi), "WrongUnit", "imu_gyro_x.*degrees/s. Write .*0.0174"),
     "gyro in milliradians": (lambda t: scaled(t, GYRO, 1e3), "WrongUnit", "imu_gyro_x.*milliradians"),
     "gyro three times too fast": (lambda t: scaled(t, GYRO, 6.0), "WrongUnit", "times the derivative"),
     "gyro of a body with z down": (lambda t: scaled(t, GYRO[1:], -1), "WrongFrame", "y right and z down"),
@@ -95,18 +91,10 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
     "world to body": (lambda t: scaled(t, TURN[:3], -1), "WrongQuaternion", "if the quaternion is from world to body"),
     "scalar first": (lambda t: {n: t[k] for n, k in zip(TURN, ("qw", *TURN))}, "WrongQuaternion", "first"),  # noqa: B905
     "not of length 1": (lambda t: scaled(t, TURN, 0.5), "WrongQuaternion", "length 1.*0.5"),
-    "millimetres": (
-        lambda t: scaled(t, PLACE + SPEED, 1e3),
-        "WrongUnit",
-        "px.*millimetres.*0.001.*vx.*0.001",
-    ),
+    "millimetres": (lambda t: scaled(t, PLACE + SPEED, 1e3), "WrongUnit", "px.*millimetres.*0.001.*vx.*0.001"),
     "mixed lengths": (lambda t: scaled(t, SPEED, 1e3), "WrongUnit", "vx, vy, vz.*1e\\+03 times"),
     "z down": (lambda t: scaled(t, ("pz", "vz"), -1), "WrongFrame", "z points down. If only z.*scale=.1.0, 1.0, -1"),
-    "accelerometer down": (
-        lambda t: scaled(t, FORCE[2:], -1),
-        "WrongFrame",
-        "other direction.*scale=",
-    ),
+    "accelerometer down": (lambda t: scaled(t, FORCE[2:], -1), "WrongFrame", "other direction.*scale="),
     "accelerometer in m/s^2": (lambda t: scaled(t, FORCE, G), "WrongUnit", "mean length of 97.*in m/s.2, write"),
     "accelerometer in g": (lambda t: scaled(t, FORCE, 1 / G), "WrongUnit", "in g, write"),
     "accelerometer in mg": (lambda t: scaled(t, FORCE, 1e3 / G), "WrongUnit", "in thousandths of g, write"),

@@ -144,7 +144,6 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
     env.params = env.nominal.replace(linear_drag=drag)
     actor = make_actor(env, in_keys=["observation", ("state", "velocity")], return_log_prob=True)
     called = TensorDictSequential(actor)
-    explorer = make_actor(env, in_keys=actor.in_keys, return_log_prob=True, noise_correlation=0.9)
 
     def seeded():
         env.set_seed(0)
@@ -188,12 +187,12 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
         with monkeypatch.context() as patch:
             look_at_nothing(patch)
             as_on_an_accelerator = train(actor)
-        flights = train(actor), train(called), train(explorer), optimise_actions(), train_with_clipped_gradients()
+        flights = train(actor), train(called), optimise_actions(), train_with_clipped_gradients()
         return *flights, in_torchrls_loop, as_on_an_accelerator
 
     eager, eager_audit, (broken, broken_grads) = all_ways(), audit(), break_drones(env, drag)
     env.compile()
-    assert env.flies_inside(actor) and env.flies_inside(explorer) and not env.flies_inside(called)
+    assert env.flies_inside(actor) and not env.flies_inside(called)
     all_ways()
     assert audit() == pytest.approx(eager_audit, rel=1e-9)
     compiled_so_far = counters["stats"]["unique_graphs"]
@@ -221,7 +220,7 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
 
 
 def test_drones_that_break_crash_alone_in_a_compiled_step():
-    env = HoveringEnv(num_envs=3, integrator="rk4", action_delay=0, dt=0.01, control_dt=0.01)
+    env = HoveringEnv(num_envs=3, integrator="euler", action_delay=0, dt=0.01, control_dt=0.01)
     mass = env.nominal.mass.clone().requires_grad_()
     env.params = env.nominal.replace(mass=mass)
     expected, expected_grads = break_drones(env, mass)

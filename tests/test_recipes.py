@@ -15,15 +15,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType
 from torchrl.objectives import SoftUpdate
 
-from torchrl_quad import (
-    HoveringEnv,
-    LandingEnv,
-    SHACLoss,
-    differentiable_rollout,
-    make_actor,
-    make_value,
-    restart,
-)
+from torchrl_quad import HoveringEnv, LandingEnv, SHACLoss, differentiable_rollout, make_actor, make_value, restart
 from torchrl_quad.envs import TASKS
 from torchrl_quad.envs.metrics import EPISODE_METRICS
 from torchrl_quad.files import read_rows
@@ -53,7 +45,7 @@ def no_garbage_of_others():
 
 @pytest.mark.usefixtures("no_garbage_of_others")
 def test_a_compiled_run_learns_what_an_eager_one_does(train, no_pictures, tmp_path):
-    small = ["env.dynamics=point_mass", "hydra.job_logging.root.level=WARNING"]
+    small = ["env.dynamics=point_mass", "actor.noise_correlation=0.9", "hydra.job_logging.root.level=WARNING"]
     for mode in ("false", "true"):
         train("bptt", tmp_path / mode, *small, f"compile={mode}")
     eager, compiled = (read_rows(tmp_path / mode / "metrics.csv") for mode in ("false", "true"))
@@ -153,7 +145,7 @@ def judged(actor, seed=99, **options):
 
 def test_shac_learns_to_hover_in_seconds():
     coarse = {"num_envs": 64, "control_dt": 0.05, "dt": 0.01, "max_episode_steps": 100}  # few steps a second of flight
-    iterations = 80
+    iterations = 60
     env = HoveringEnv(seed=0, **coarse)
     actor = make_actor(env, input_scale=0.5)
     loss = SHACLoss(actor, make_value(env, input_scale=0.5))

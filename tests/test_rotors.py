@@ -256,7 +256,10 @@ def test_a_drone_of_a_contract_flies_in_mujoco_as_in_the_package_also_with_a_dea
         "simulator": simulator,
         "origin": {"package": ""},
         "task": {"name": "", "unjudged": ""},
+        "output": {"control": "rates", "gains": {}, "range": [[0, 9], [-6, 6]], "thrust": {"range": [0, 9]}},
+        "obstacles": None,
     }
+    flown["output"]["body_rate"] = {"range": 3 * [[-6, 6]]}
     plant = {"rotor_effectiveness": [0.0, *[1.0] * (len(LAYOUTS[name]["rotor_spin"]) - 1)]}
     flown |= {"camera": None, "drone": fields(drone(name)), "plant": plant}
     start = {"position": np.zeros((1, 3)), "quaternion": np.eye(4)[:1], "velocity": np.zeros((1, 3))}
@@ -266,7 +269,7 @@ def test_a_drone_of_a_contract_flies_in_mujoco_as_in_the_package_also_with_a_dea
         world = make_simulator(kind, flown)
         world.reset(start)
         for _ in range(10):
-            world.step(np.array([5.0]), np.array([[0.5, 1.0, -0.2]]))
+            world.step(np.array([[5.0, 0.5, 1.0, -0.2]]))
         ends.append(world.state())
     assert abs(ends[0]["angular_velocity"]).max() > 0.3 and abs(ends[0]["velocity"][0, :2]).max() > 0.05
     for key, x in ends[0].items():

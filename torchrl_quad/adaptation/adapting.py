@@ -120,12 +120,11 @@ class Adapter:
                 "speeds. Give motors=MotorCommand(speed_per_volt, nominal_voltage); for commands that are shares of a "
                 "rotor speed of 4000 rad/s, MotorCommand(4000.0, 1.0)."
             )
-        prediction.log_columns(base.params)
         self.policy: Any = copy.deepcopy(policy)
-        self.flown = Flown(base.params)
+        self.flown = Flown(prediction.as_params(base.params))
         self.max_kl, self.steps, self.horizon, self.lr, self.seed = max_kl, steps, horizon, lr, seed
-        kept = [x for x in base._options["disturbances"]]
-        inner = base.rebuilt(num_envs=num_envs, seed=seed, randomize=None, wind=None, disturbances=[*kept, self.flown])
+        kept = [*base._options["disturbances"], self.flown]
+        inner = base.rebuilt(num_envs=num_envs, seed=seed, randomize=None, wind=None, disturbances=kept)
         self.task, self.env = inner, inner
         if isinstance(env, TransformedEnv):
             self.env = TransformedEnv(inner, cast(Any, env.transform).clone())

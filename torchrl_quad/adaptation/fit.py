@@ -139,7 +139,8 @@ def fit_flight(logs: Sequence[FlightLog], drone: QuadrotorParams, motors: MotorC
             break
         open_ = {name: group for name, group in open_.items() if name not in wide}
     kept = [errors(nothing)[held], errors(x)[held]]
-    squares = [(e / scale).square().clamp_max(100.0).mean() for e in kept]
+    # Errors below those of a good fit say nothing.
+    squares = [(e / scale).square().clamp_max(100.0).mean().clamp_min(1.0) for e in kept]
     rms = [
         {"acceleration": float(e[:, :3].square().sum(1).mean().sqrt()),
          "angular_acceleration": float(e[:, 3:].square().sum(1).mean().sqrt())}

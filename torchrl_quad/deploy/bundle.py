@@ -26,6 +26,7 @@ from torchrl_quad.deploy.contract import (
     WrongActions,
 )
 from torchrl_quad.deploy.reading import read
+from torchrl_quad.deploy.simulators.vehicle import Drone
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
 
 START = np.array([1.0, 0.0, 0.0, 0.0])  # the quaternion that the first one of a flight takes its sign from
@@ -51,9 +52,9 @@ class Bundle:
         contract: the content of ``contract.json``.
         graphs: its ONNX files, by name.
         observation: what the network read last, float32 (k).
-        action: what it answered, or the hover action after a fault; float32 (4).
+        action: what it answered, or the hover action after a fault; float32 (k).
         memory: what the network remembers, float32 (m); zeros at the start of a flight, and as it was after a fault.
-        queue: the last commands, oldest first, float32 (action_delay, 4).
+        queue: the last commands, oldest first, float32 (action_delay, k).
         faults: how many faults of each kind there were since the bundle was loaded, by the name of the error.
         last_fault: the last of them, or None.
     """
@@ -67,6 +68,8 @@ class Bundle:
         self.last_fault: Fault | None = None
         self._hover = np.array(contract["output"]["hover_action"], np.float32)
         self._limits, self._camera, self._dtype = contract["limits"], contract["camera"], contract["task"]["dtype"]
+        low, high = np.array(contract["output"]["range"]).T
+        self._middle, self._half = 0.5 * (low + high), 0.5 * (high - low)
         self.reset()
 
     def reset(self, **entries: Any) -> None:
@@ -97,7 +100,7 @@ class Bundle:
         """The entries of the task by name, where the flight is in it, such as ``bundle.progress["gate"]``."""
         return {name: x[0].copy() for name, x in self._progress.items()}
 
-    def __call__(self, state: Mapping[str, Any]) -> tuple[float, NDArray[np.float64]]:
+    def __call__(self, state: Mapping[str, Any]) -> tuple[Any, Any]:
         """The command for this control step.
 
         Args:
@@ -109,7 +112,13 @@ class Bundle:
                 entries are ignored.
 
         Returns:
-            the collective thrust [N] and the body rates (3) [rad/s].
+            by the contract's ``output.control``:
+
+            - rates: the collective thrust [N] and the body rates (3) [rad/s];
+            - attitude: the collective thrust [N], and roll and pitch [rad] with the rate of yaw [rad/s] (3);
+            - velocity: the velocity (3) [m/s], world frame, and the rate of yaw [rad/s];
+            - rotor_thrusts: the thrust of each rotor (n) [N], and the same as motor signals (n) from 0 to 1, by the
+              thrust map of the drone: 0 is its ``rotor_speed_min``, 1 its ``rotor_speed_max``, and linear between.
 
         Raises:
             Fault: the policy cannot fly from this state; the bundle is as before the call, as after any other error.
@@ -133,11 +142,18 @@ class Bundle:
         vars(self).update(after)  # from here on nothing fails
         return command
 
-    def command(self, action: NDArray[Any]) -> tuple[float, NDArray[np.float64]]:
-        """The collective thrust [N] and the body rates (3) [rad/s] that an action (4) commands."""
-        output = self.contract["output"]
-        thrust = 0.5 * output["thrust"]["range"][1] * (float(action[0]) + 1.0)
-        return thrust, np.array(output["body_rate"]["range"])[:, 1] * action[1:].astype(float)
+    def command(self, action: NDArray[Any]) -> tuple[Any, Any]:
+        """The pair that an action (k) commands, as a call returns it."""
+        control, x = self.contract["output"]["control"], self.commanded(action)
+        if control == "rotor_thrusts":
+            drone = Drone(self.contract["drone"])
+            low, high = drone.rotor_speed_min, drone.rotor_speed_max
+            return x, (drone.speed(np.clip(x, *drone.thrust_limits)) - low) / (high - low)
+        return (x[:3], float(x[3])) if control == "velocity" else (float(x[0]), x[1:])
+
+    def commanded(self, action: NDArray[Any]) -> NDArray[np.float64]:
+        """The same as numbers (k) in the contract's ``output.units``."""
+        return self._middle + self._half * action
 
     def starts(self) -> Arrays:
         """The fresh starts that came with it: ``position``, ``quaternion``, ``velocity`` and ``angular_velocity``, as a

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torchrl_quad.airframe import contradictions, matrix, uncontrolled
 from torchrl_quad.errors import MissingPackage, UserError, UserValueError, one_line, shown
 
-VERSION = 4  # of the contract; raise it when a reader of the older one would misunderstand the new one
+VERSION = 5  # of the contract; raise it when a reader of the older one would misunderstand the new one
 GRAPHS = ("policy", "observe", "advance", "judge", "episode")  # the ONNX files that a bundle may have
 OTHERS = ("README.md", "policy.c", "policy.h", "starts.npz", "vectors.npz")  # files beside these and contract.json
 AUTOPILOTS = ("betaflight.txt", "px4.params", "crazyflie.txt")  # and these, where they exist
@@ -65,7 +65,7 @@ class NegativeDepth(Fault):
 
 
 class BrokenPolicy(Fault):
-    """The network failed, or answered something else than four numbers from -1 to 1."""
+    """The network failed, or answered something else than its numbers from -1 to 1."""
 
 
 def schema() -> Fields:
@@ -113,10 +113,32 @@ def digest(contract: Contract) -> str:
 # -- what the contract says --------------------------------------------------------------------------------------------
 
 
+def upgraded(contract: Contract) -> Contract:
+    """A contract in the words of this version. Those of version 4 all command thrust and body rates."""
+    if contract["version"] != 4:
+        return contract
+    output = contract["output"]
+    range_ = [output["thrust"]["range"], *output["body_rate"]["range"]]
+    own = {"control": "rates", "units": ["N", *3 * ["rad/s"]], "range": range_, "law": "", "gains": {}}
+    task = {"documentation": "", "constants": {}} | contract["task"]
+    return {**contract, "version": VERSION, "task": task, "output": output | own, "obstacles": None}
+
+
 def problem(contract: Contract) -> str | None:
     """Where a contract does not fit its schema, or its drones cannot fly, if anywhere."""
-    misfit = next(_misfits(contract), None)
-    return misfit or next(_contradictions(contract["drone"], "drone", hovers=True), None) or drone_problem(contract)
+    found = itertools.chain(_misfits(contract), _unequal(contract))
+    found = itertools.chain(found, _contradictions(contract["drone"], "drone", hovers=True))
+    return next(found, None) or drone_problem(contract)
+
+
+def _unequal(contract: Contract) -> Iterator[str]:
+    """Which parts of the output do not have an entry for each number of an action."""
+    output, n = contract["output"], contract["graphs"]["policy"]["writes"].get("action", {}).get("shape")
+    wrong = [name for name in ("order", "units", "range", "hover_action") if [len(output[name])] != n]
+    if wrong:
+        yield f"output.{wrong[0]} does not have as many entries as an action of the policy"
+    elif output["control"] == "rotor_thrusts" and n != [len(contract["drone"]["rotor_spin"])]:
+        yield "output: rotor_thrusts needs an entry for each rotor of the drone"
 
 
 def drone_problem(contract: Contract) -> str | None:

@@ -20,7 +20,7 @@ from torchrl_quad.deploy import autopilots
 from torchrl_quad.deploy.contract import GRAPHS, MEASURED, Contract, Fields, schema_table
 from torchrl_quad.deploy.network import fill_in
 from torchrl_quad.deploy.tracing import Rules
-from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams
+from torchrl_quad.dynamics import CONTROLS, DYNAMICS, QuadrotorParams, make_controller
 from torchrl_quad.dynamics.parameters import LIMITS
 from torchrl_quad.envs import TASKS, QuadrotorEnv
 from torchrl_quad.envs.disturbances import DroneRandomization, Sensors, Wind
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from onnx import ModelProto
 
 DTYPES = {1: "float32", 11: "float64", 7: "int64", 9: "bool"}  # by their numbers in ONNX
+NO_RULE = ("training", "is_closed", "num_envs", "control_dt", "action_delay", "max_episode_steps")  # of an environment
+MOST_LETTERS, MOST_NUMBERS = 20_000, 4096  # of the documentation of a task, and of one of its constants
 UNITS = {  # unit and frame of what is measured and commanded
     "position": {"unit": "m", "frame": "world"},
     "quaternion": {"unit": "1", "frame": "body to world"},
@@ -68,10 +70,11 @@ def describe(env: QuadrotorEnv, rules: Rules, models: Mapping[str, ModelProto], 
         "task": _task(env, rules),
         "graphs": {name: _graph(models[name]) for name in GRAPHS if name in models},
         "camera": None if camera is None else _camera(camera),
+        "obstacles": None if env.scene is None else {"radius": env.scene.radius, **env.scene.fixed},
         "memory": memory,
         "quaternion": {"order": "wxyz", "frame": "body (x forward, y left, z up) to world (z up)", "sign": SIGN},
         "output": {
-            "order": ["thrust", "roll_rate", "pitch_rate", "yaw_rate"],
+            **_commands(env),
             "thrust": {
                 "unit": "N",
                 "range": [0.0, numbers(np.float32(most))],
@@ -123,12 +126,26 @@ def _task(env: QuadrotorEnv, rules: Rules) -> Fields:
     return {
         "name": next((name for name, known in TASKS.items() if known is cls), f"{cls.__module__}.{cls.__qualname__}"),
         "about": next(iter((cls.__doc__ or "").strip().splitlines()), ""),
+        "documentation": inspect.cleandoc(cls.__doc__ or "")[:MOST_LETTERS],
+        "constants": _constants(env),
         "max_episode_steps": env.max_episode_steps,
         "dtype": str(env.dtype).removeprefix("torch."),
         "entries": entries,
         "metrics": metrics,
         "unjudged": rules.unjudged,
     }
+
+
+def _constants(env: QuadrotorEnv) -> Fields:
+    """The numbers of a task by the names that its class gives them, such as gates, and the radius of success."""
+    cls, found = type(env), {}
+    for part in reversed(cls.__mro__[: cls.__mro__.index(QuadrotorEnv)]):
+        found |= vars(part)
+    found |= {name: x.detach().cpu() if isinstance(x, Tensor) else x for name, x in vars(env).items()}
+    plain = {
+        name: np.asarray(x) for name, x in found.items() if name[0] != "_" and name not in NO_RULE and _is_plain(x)
+    }
+    return {name: numbers(x) for name, x in plain.items() if 0 < x.size <= MOST_NUMBERS and np.isfinite(x).all()}
 
 
 def _graph(model: ModelProto) -> Fields:
@@ -205,12 +222,52 @@ def _rate_loop(env: QuadrotorEnv, drone: Contract) -> Fields | None:
         "every simulator.dt: w += dt a and, at once, a += (1 - exp(-dt / motor_time_constant)) "
         "(gain (desired - w) - (1 + rate_damping / inertia) a)"
     )
-    if "rate_integral" in env.dynamics.sizes:
-        law += (
-            ". With desired = commanded + i; each step also l += (1 - exp(-2 pi 15 dt)) (commanded - l) and "
-            "i += dt 0.1 B (commanded - w) max(0, 1 - |commanded - l| / 40 deg/s), B being the bandwidth for dt to 0"
-        )
-    return {"law": law, "gain": drone["rate_gain"], **values}
+    torque = (
+        "torque = inertia gain (desired - w) - rate_damping a + w x (inertia w), with a = (the torque of the rotors at "
+        "their present speeds - w x (inertia w)) / inertia; so no moment of the air is known to it, and there is no "
+        "integral. The rotor thrusts are those of least squares that make this torque and the collective thrust. Where "
+        "one would leave its limits, in this order: roll and pitch torque shrink by one factor, if they need more than "
+        "the whole range; collective thrust moves by as little as makes room for them; yaw torque shrinks to what fits"
+    )
+    if type(getattr(env.dynamics, "controller", None)) not in CONTROLS.values():
+        torque = inspect.cleandoc(type(env.dynamics).__doc__ or "")[:2000]
+    return {"law": law, "torque": torque, "gain": drone["rate_gain"], **values}
+
+
+LAWS = {  # from a command to what rotors do; in each physics step
+    "rates": "the collective thrust and the body rates go to the rate loop",
+    "attitude": "collective thrust goes to the rate loop. Roll and pitch are Euler angles, in the order z, y, x; the "
+    "heading is free. With the world's up in the body frame, u, the wanted one, u' = (-sin(pitch), sin(roll) "
+    "cos(pitch), cos(roll) cos(pitch)), e = u' x u, and s(x, l) = x / sqrt(1 + |x / l|^2), the body rates are x and y: "
+    "s(tilt_gain e, body_rate.range) + yaw_rate u, and z: yaw_rate u",
+    "velocity": "with s(x, l) = x / sqrt(1 + |x / l|^2) and the error of the velocity e, the wanted acceleration is z: "
+    "gravity + s(velocity_gain e, max_climb), and x and y, as one vector: s(velocity_gain e, z tan(max_tilt)). In the "
+    "body frame it is a. The collective thrust is mass a_z, within thrust.range; the body rates are x and y: "
+    "s(tilt_gain (-a_y, a_x) / |a|, body_rate.range), and z: yaw_rate times the world's up along body z",
+    "rotor_thrusts": "each rotor is asked for the speed at which drone.thrust_map gives its thrust, within "
+    "drone.rotor_speed_min and drone.rotor_speed_max; as a signal from 0 to 1 it is (speed - min) / (max - min)",
+}
+GAINS = ("tilt_gain", "velocity_gain", "max_climb", "max_tilt")  # of the controllers that have them
+
+
+def _commands(env: QuadrotorEnv) -> Fields:
+    """What the entries of an action command, and the law that follows a command."""
+    controller = getattr(env.dynamics, "controller", None) or make_controller("rates", env.nominal)
+    names = (name for name, cls in reversed(CONTROLS.items()) if isinstance(controller, cls))  # rates, their base, last
+    mode = next(names, type(controller).__name__)
+    if mode not in LAWS or (mode == "rates" and controller.action_units != CONTROLS[mode].action_units):
+        raise UserValueError(f"export_policy exports the controls {', '.join(LAWS)}; got {mode!r}.")
+    one = torch.ones_like(controller.hover_action)
+    low, high = (numbers(_single("the range of actions", controller.decode(x).float(), 1)) for x in (-one, one))
+    gains = {name: torch.as_tensor(getattr(controller, name)) for name in GAINS if hasattr(controller, name)}
+    return {
+        "control": mode,
+        "order": [name.replace(" ", "_") for name in controller.action_units],
+        "units": [*controller.action_units.values()],
+        "range": [list(pair) for pair in zip(low, high, strict=True)],
+        "law": LAWS[mode],
+        "gains": {name: numbers(_single(name, torch.atleast_1d(x.float()), 1)) for name, x in gains.items()},
+    }
 
 
 # -- what has flown ----------------------------------------------------------------------------------------------------
@@ -272,9 +329,16 @@ def write_page(contract: Contract, documentation: str | None) -> bytes:
         "starts": ", ".join(f"`{name}`" for name in (*MEASURED, *task["entries"])),
         "memory": contract["memory"],
         "sign": contract["quaternion"]["sign"],
-        "max_thrust": f"{output['thrust']['range'][1]:.6g}",
+        "actions": len(output["order"]),
+        "answers": ", ".join(name.replace("_", " ") for name in output["order"]),
+        "commands": "\n".join(
+            f"| {i} | {name.replace('_', ' ')} | {low:.6g} | {high:.6g} | {unit} |"
+            for i, (name, unit, (low, high)) in enumerate(
+                zip(output["order"], output["units"], output["range"], strict=True)
+            )
+        ),
+        "law": output["law"],
         "weight": f"{output['thrust']['weight']:.6g}",
-        "rates": ", ".join(f"{high:g}" for _, high in output["body_rate"]["range"]),
         "hover": ", ".join(f"{x:.6g}" for x in output["hover_action"]),
         "control_dt": f"{contract['control_dt']:g}",
         "delay": contract["action_delay"],

@@ -102,7 +102,7 @@ def export_policy(
         raise UserValueError(f"export_policy: the policy reads {width} numbers, the environment observes {size}.")
     policy = actor if normalizer is None else normalized(actor, normalizer)
     count, self_test = (IMAGES, SELF_TEST_IMAGES) if "depth" in reads else (VECTORS, SELF_TEST_VECTORS)
-    whole, replayed, chosen = _fly(task, policy, count)
+    first, whole, replayed, chosen = _fly(task, policy, count)
     vectors = _vectors(policy, task, chosen)
     n = 3 if task.num_envs != 3 else 4  # rules that only work for the environment's own number do not trace
     states = {key: leaf(replayed, _below("state", key)).flatten(0, 1)[:n] for key in task.control_step.safe_state}
@@ -123,8 +123,8 @@ def export_policy(
             **(origin or {}),
         },
     }
-    keys = {name: name for name in MEASURED} | rules.entries
-    starts = {name: _array(leaf(whole, _below("state", key))[:, 0]) for name, key in keys.items()}
+    keys = {name: name for name in MEASURED} | rules.entries | rules.obstacles
+    starts = {name: _array(leaf(first, _below("state", key))) for name, key in keys.items()}
     files = {f"{name}.onnx": x.SerializeToString(deterministic=True) for name, x in models.items()}
     files |= {"vectors.npz": _npz(vectors), "starts.npz": _npz(starts)}
     files["README.md"] = write_page(contract, type(task).__doc__)
@@ -161,17 +161,16 @@ def _unwrapped(
     base = base_env(env)
     if not isinstance(base, QuadrotorEnv):
         raise UserValueError(f"export_policy needs an environment of this package, got {type(env).__name__}.")
-    if base.control != "rates":
-        raise UserValueError(f'export_policy exports thrust and body rates, control="rates"; got {base.control!r}.')
     if normalizer is not None and list(normalizer.in_keys) != ["observation"]:
         raise UserValueError(f'export_policy: the normalizer must be that of "observation", got {normalizer.in_keys}.')
     return base, normalizer
 
 
 @torch.no_grad()
-def _fly(env: QuadrotorEnv, policy: TensorDictModuleBase, count: int) -> tuple[TensorDict, TensorDict, TensorDict]:
-    """A deterministic flight from fresh starts: (num_envs, time) without what is never judged, (REPLAYED, time) with
-    everything, and (count), what the policy reads in single steps. The environment then continues as if not flown."""
+def _fly(env: QuadrotorEnv, policy: TensorDictModuleBase, count: int) -> tuple[TensorDictBase, ...]:
+    """A deterministic flight: its fresh starts (num_envs); (num_envs, time) without what is never judged; (REPLAYED,
+    time) with everything; and (count), what the policy reads in single steps. The environment then continues as if not
+    flown."""
     steps = max(env.max_episode_steps, -(-VECTORS // env.num_envs))
     at = torch.linspace(0, env.num_envs * steps - 1, count).long()
     drone, step = at // steps, at % steps
@@ -183,6 +182,7 @@ def _fly(env: QuadrotorEnv, policy: TensorDictModuleBase, count: int) -> tuple[T
         env.set_initial_state_source(None)
         env.randomness.seed(STARTS)
         carry, begin = env.reset(), 0
+        first = carry.clone()
         longest = max(1, MOST_NUMBERS // sum(x.numel() for x in carry.values(True, True)))
         while begin < steps:
             part, carry = differentiable_rollout(env, policy, carry, min(longest, steps - begin), **mode)
@@ -197,7 +197,7 @@ def _fly(env: QuadrotorEnv, policy: TensorDictModuleBase, count: int) -> tuple[T
         env.set_initial_state_source(source)
         env.set_random_state(random)
     all_of_it, again, chosen = (cast(TensorDict, torch.cat(x, i)) for i, x in ((1, whole), (1, replayed), (0, read)))
-    return all_of_it, again, cast(TensorDict, chosen[leaf(chosen, "place").argsort()])
+    return first, all_of_it, again, cast(TensorDict, chosen[leaf(chosen, "place").argsort()])
 
 
 @torch.no_grad()
@@ -270,7 +270,8 @@ def _check_the_flight(
     for name in MEASURED:
         before, after = (leaf(flights, key) for key in (("state", name), ("next", "state", name)))
         flown[name] = _array(torch.cat((before[:, :1], after), 1))
-    flown |= {name: _array(leaf(flights, _below("state", key))[:, 0]) for name, key in rules.entries.items()}
+    starts = rules.entries | rules.obstacles
+    flown |= {name: _array(leaf(flights, _below("state", key))[:, 0]) for name, key in starts.items()}
     expected = env.episode_metrics(flights)
     for name, found in judge(bundle, flown).items():
         own = _array(expected[name])

@@ -29,6 +29,7 @@ class Judge:
         self.queue = np.tile(hover, (n, contract["action_delay"], 1))
         self.state = self._drone(starts) | {name: starts[name] for name in self.entries}
         self.state["step"] = np.zeros((n, 1), np.int64)
+        self.obstacles = {name: x for name, x in starts.items() if name.startswith("scene.")}
         self.states: list[Arrays] = [self.state]
         self.actions: list[NDArray[Any]] = []
         self.found: list[Arrays] = []
@@ -45,7 +46,7 @@ class Judge:
         self.state = self.state | self._drone(state) | {"step": self.state["step"] + 1}
         if "advance" in self.graphs:
             self.state |= self.graphs["advance"](before | self.state)
-        found = self.graphs["judge"](self.state)
+        found = self.graphs["judge"](before | self.state | self.obstacles)
         found["done"] = found["terminated"] | found["truncated"]
         self.states.append(self.state)
         self.actions.append(np.asarray(action, self.dtype))
@@ -70,7 +71,7 @@ class Judge:
 
 def judge(bundle: Bundle, flight: Arrays) -> Arrays:
     """Judge the first episodes of a flight: by name ``action`` (n, time, 4), the drone's quantities (n, time + 1, ...),
-    of which the first are the start, and the task's entries (n, ...) that it starts with."""
+    of which the first are the start, and the task's entries and the obstacles (n, ...) that it starts with."""
     first = {name: flight[name][:, 0] for name in MEASURED}
     found = Judge(bundle, flight | first)
     for t in range(flight["action"].shape[1]):

@@ -108,7 +108,7 @@ def write_onnx(network: Network) -> ModelProto:
     """The network as ONNX, all float32, with a free batch axis. The same weights give the same bytes.
 
     It reads ``observation`` (batch, k), ``depth`` (batch, 1, height, width) and ``memory`` (batch, m), of those that
-    there are, and returns ``action`` (batch, 4) and ``next_memory``.
+    there are, and returns ``action`` (batch, actions) and ``next_memory``.
     """
     from onnx import TensorProto, helper, numpy_helper  # only who exports needs it
 
@@ -183,6 +183,7 @@ def onnx_model(name: str, nodes: list[Any], reads: list[Any], writes: list[Any],
 def write_c(network: Network, contract: Contract, vectors: Mapping[str, Array]) -> dict[str, bytes]:
     """The network as C99: the files ``policy.h`` and ``policy.c``; vectors (n, ...) by name are for the self-test."""
     output, reads = contract["output"], network.reads
+    turns_rotors = output["control"] == "rotor_thrusts"
     names = sorted({layer.activation for layer in (*network.convolutions, *network.layers)})
     tests = {f"test_{name}": _rows(x.reshape(len(x), -1)) for name, x in vectors.items()}
     others = [name for name in reads if name != "observation"]
@@ -193,12 +194,15 @@ def write_c(network: Network, contract: Contract, vectors: Mapping[str, Array]) 
     values = {
         "task": contract["task"]["name"],
         "version": contract["version"],
-        "control_dt": _float(contract["control_dt"]),
+        "control_dt": as_float(contract["control_dt"]),
         "action_delay": contract["action_delay"],
-        "hover_action": _floats(output["hover_action"]),
-        "max_thrust": _float(output["thrust"]["range"][1]),
-        "max_rates": _floats(high for _, high in output["body_rate"]["range"]),
-        "limit": _float(network.limit),
+        "hover_action": as_floats(output["hover_action"]),
+        "actions": len(output["order"]),
+        "names": ", ".join(f"{name} [{unit}]" for name, unit in zip(output["order"], output["units"], strict=True)),
+        "middle": as_floats(0.5 * (high + low) for low, high in output["range"]),
+        "half": as_floats(0.5 * (high - low) for low, high in output["range"]),
+        **(_rotors(contract["drone"]) if turns_rotors else {}),
+        "limit": as_float(network.limit),
         "activations": "\n".join(
             f"static float {name.lower()}_of(float x) {{ return {ACTIVATIONS[name][1]}; }}" for name in names
         ),
@@ -214,7 +218,18 @@ def write_c(network: Network, contract: Contract, vectors: Mapping[str, Array]) 
         "recalled": network.layers[-1].weight.shape[1],
         "layers": "\n".join(f"    {line}" for line in _steps(network)),
     }
-    return {name: fill_in(name, values, others).encode() for name in ("policy.h", "policy.c")}
+    features = [*others, "rotors"] if turns_rotors else others
+    return {name: fill_in(name, values, features).encode() for name in ("policy.h", "policy.c")}
+
+
+def _rotors(drone: Contract) -> dict[str, str]:
+    """The constants that turn the thrust of a rotor into its motor signal, with thrust k2 (w - w0)^2 + f0."""
+    (k2, k1, k0), low, high = drone["thrust_map"], drone["rotor_speed_min"], drone["rotor_speed_max"]
+    least, most = (k2 * w * w + k1 * w + k0 for w in (low, high))
+    span = high - low
+    numbers = {"least": max(least, 0.0), "most": most, "thrust_0": k0 - k1 * k1 / (4.0 * k2), "bend": 1.0 / k2}
+    numbers |= {"signal_0": (-0.5 * k1 / k2 - low) / span, "per_speed": math.copysign(1.0, k2) / span}
+    return {name: as_float(value) for name, value in numbers.items()}
 
 
 def fill_in(template: str, values: Mapping[str, Any], features: Collection[str]) -> str:
@@ -233,7 +248,7 @@ def _steps(network: Network) -> Iterator[str]:
     x = "observation"
     if network.convolutions:
         x = next(places)
-        yield f"for (int i = 0; i < POLICY_DEPTH; ++i) {x}[i] = 1.0f / fmaxf(depth[i], {_float(network.nearest)});"
+        yield f"for (int i = 0; i < POLICY_DEPTH; ++i) {x}[i] = 1.0f / fmaxf(depth[i], {as_float(network.nearest)});"
         images = network.images
         for i, (layer, (channels, height, width), after) in enumerate(
             zip(network.convolutions, images, images[1:], strict=False)
@@ -275,18 +290,19 @@ def _constants(network: Network) -> Iterator[str]:
 
 
 def _constant(name: str, value: Array) -> str:
-    text = f"{{\n{_rows(value)}\n}}" if value.ndim == 2 else f"{{{_floats(value)}}}"
+    text = f"{{\n{_rows(value)}\n}}" if value.ndim == 2 else f"{{{as_floats(value)}}}"
     return f"static const float {name}[{value.size}] = {text};"
 
 
 def _rows(values: Array) -> str:
-    return ",\n".join(f"    {_floats(row)}" for row in values)
+    return ",\n".join(f"    {as_floats(row)}" for row in values)
 
 
-def _floats(values: Any) -> str:
-    return ", ".join(map(_float, values))
+def as_floats(values: Any) -> str:
+    """Numbers as C writes them, with commas between."""
+    return ", ".join(map(as_float, values))
 
 
-def _float(value: Any) -> str:
+def as_float(value: Any) -> str:
     """A float32 as C writes it, without loss."""
     return f"{float(str(np.float32(value)))!r}f"

@@ -41,6 +41,7 @@ class Rules(NamedTuple):
     #: ONNX models by name, "observe" and those that there are of "advance", "judge", "episode"
     graphs: dict[str, ModelProto]
     entries: dict[str, Key]  #: the keys in the state of the task's own entries that these read, by name
+    obstacles: dict[str, Key]  #: the keys in the state of the obstacles that are judged by, by name
     unjudged: str | None  #: why there are no graphs "judge" and "episode", or None
 
 
@@ -79,28 +80,34 @@ class _Methods:
 
     What a bundle has, keeps its name in the state: the drone's quantities, the task's entries, ``step`` and
     ``action_queue``. ``previous.`` begins the names of the step before, ``flight.`` those of whole flights (n, time,
-    ...), and ``hidden.`` those of what a bundle does not have.
+    ...), ``scene.`` those of obstacles, which only a judge has, and ``hidden.`` those of what a bundle does not have.
     """
 
     def __init__(self, env: QuadrotorEnv, state: State) -> None:
-        self.env, self.unjudged = env, None if env.scene is None else "its drones crash into obstacles"
+        self.env = env
+        self.unjudged: str | None = None
         self.changing = [*MEASURED, *(["action_queue"] if "action_queue" in state else [])]
         self.known = {name_of(key): key for key in (*self.changing, *env.task_entries, "step")}
         self.hidden = {f"hidden.{name_of(key)}": key for key in state if key not in self.known.values()}
         self.inputs = {name: state[key] for name, key in (self.known | self.hidden).items()}
         self.inputs |= {f"previous.{name}": state[name].clone() for name in self.changing}
-        self.methods: list[Method] = [self.observe, self.advance]
+        self.obstacles: dict[str, Key] = {
+            name_of(key): key for key in state if isinstance(key, tuple) and key[0] == "scene"
+        }
+        self.inputs |= {name: state[key].clone() for name, key in self.obstacles.items()}
+        self.methods: list[Method] = [self.observe, self.advance, self.judge, self.measure, self.sum_up]
         self.flight: dict[str, tuple[str, ...]] = {}
-        if self.unjudged is None:
-            self.methods += [self.judge, self.measure, self.sum_up]
-            self._add_flight(len(state["step"]))
+        self._add_flight(len(state["step"]))
 
     def _add_flight(self, n: int) -> None:
         """Add what ``episode_metrics`` may read."""
         env, x = self.env, self.inputs
         parts = {("next", name): torch.zeros(n, 1, dtype=torch.bool, device=env.device) for name in (*ENDS, "done")}
-        parts |= {("next", "metrics", name): value for name, value in env.metrics(self.state(x)).items()}
-        parts |= {("next", "reward"): env.tensor(n * [[0.0]]), ("action",): env.tensor(n * [4 * [0.0]])}
+        parts |= {("next", "metrics", name): value for name, value in env.metrics(self.judged(x)).items()}
+        parts |= {
+            ("next", "reward"): env.tensor(n * [[0.0]]),
+            ("action",): torch.zeros_like(env.hover_action).expand(n, -1),
+        }
         for name, key in self.known.items():
             path = (key,) if isinstance(key, str) else key
             parts |= {("state", *path): x[name], ("next", "state", *path): x[name]}
@@ -111,6 +118,14 @@ class _Methods:
 
     def state(self, x: Tensors) -> State:
         return {key: x[name] for name, key in (self.known | self.hidden).items()}
+
+    def judged(self, x: Tensors) -> State:
+        """The state with the obstacles, and whether the drone touched one on its way from the step before."""
+        state, scene = self.state(x) | {key: x[name] for name, key in self.obstacles.items()}, self.env.scene
+        if scene is not None:
+            state["collided"] = torch.zeros_like(x["step"], dtype=torch.bool)
+            state["collided"] = scene.collided({"position": x["previous.position"]}, state)
+        return state
 
     def observe(self, x: Tensors) -> Tensors:
         """``observation`` (n, k), as ControlStep.observe makes it from what the sensors show."""
@@ -127,7 +142,7 @@ class _Methods:
 
     def judge(self, x: Tensors) -> Tensors:
         """How a state ends the episode, if it does; where the guard would replace it, it is a crash."""
-        state, step = self.state(x), self.env.control_step
+        state, step = self.judged(x), self.env.control_step
         keep = is_unit(state["quaternion"]).unsqueeze(1)
         for key in MEASURED:
             low, high = (bound[:1] for bound in step.guard.bounds[key])
@@ -136,7 +151,7 @@ class _Methods:
         return {f"judge.{name}": ends[name] for name in ENDS}
 
     def measure(self, x: Tensors) -> Tensors:
-        return {f"judge.metrics.{name}": value for name, value in self.env.metrics(self.state(x)).items()}
+        return {f"judge.metrics.{name}": value for name, value in self.env.metrics(self.judged(x)).items()}
 
     def sum_up(self, x: Tensors) -> Tensors:
         """The metrics of the first episode of each flight; none where they need what a flight lacks."""
@@ -297,7 +312,8 @@ class _Cut:
             "episode": [x for x in judged if x.startswith("episode.")],
         }
         graphs = {name: self._graph(task, name, wanted) for name, wanted in outputs.items() if wanted}
-        return Rules(graphs, {name: rules.known[name] for name in self.entries if name in needed}, unjudged)
+        obstacles = {name: key for name, key in rules.obstacles.items() if name in needed}
+        return Rules(graphs, {x: rules.known[x] for x in self.entries if x in needed}, obstacles, unjudged)
 
     def _stays(self, entry: str) -> bool:
         """Whether an entry keeps its value."""

@@ -44,7 +44,7 @@ class Mutant:
     quaternion: tuple[int, ...] = (0, 1, 2, 3)  #: the order in which the bundle gets the entries of the quaternion
     attitude: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)  #: times the quaternion that the bundle gets
     measured: tuple[float, ...] = (1.0, 1.0, 1.0)  #: times the body rates that the bundle gets
-    commanded: tuple[float, ...] = (1.0, 1.0, 1.0)  #: times the body rates that it commands
+    commanded: tuple[float, ...] = (1.0, 1.0, 1.0)  #: times the rates, angles or velocity that it commands
     motors: tuple[int, ...] = (0, 1, 2, 3)  #: for each rotor the motor whose command it gets
     delay: int | None = None  #: control steps until a command takes effect, instead of the contract's
     keeps_queue: bool = True  #: whether the bundle keeps the commands on their way
@@ -75,7 +75,7 @@ def fly(
     """Fly a bundle from its fresh starts, one episode each, in a simulator.
 
     The contract's ``action_delay`` holds: the hover command is on its way at the start. States are reported as late as
-    its ``observation_delay``, but exactly.
+    its ``observation_delay``, and images as its camera takes them, but exactly.
 
     Args:
         folder: a bundle.
@@ -88,13 +88,13 @@ def fly(
 
     Returns:
         by name: the states (n, time + 1, ...), with the task's entries, the first of which is the start, the last one
-        repeated after the end of an episode; ``action`` (n, time, 4); how states end the episode (n, time):
+        repeated after the end of an episode; ``action`` (n, time, k); how states end the episode (n, time):
         ``terminated``, ``truncated``, ``success`` and ``done``; ``metrics``, the contract's ``task.metrics`` (n) by
         name; ``simulator``, name and version; ``faults``, the bundle's refusals by name.
 
     Raises:
-        ValueError: the policy reads images, or flies among obstacles, which no simulator here has; or an argument is
-            unknown or out of its range.
+        ValueError: the policy reads images, and the simulator has no camera; or an argument is unknown or out of its
+            range.
     """
     bundle = folder if isinstance(folder, Bundle) else load_bundle(folder, on_fault="hover")
     with naming(bundle.folder), np.errstate(all="ignore"):  # what a simulator cannot fly becomes NaN, and a crash
@@ -114,9 +114,13 @@ def fly(
 def _fly(bundle: Bundle, world: Simulator, judge: Judge, starts: Arrays, delay: int, mutant: Mutant) -> Fields:
     n, steps = len(starts["position"]), bundle.contract["task"]["max_episode_steps"]
     world.reset({name: starts[name] for name in MEASURED})
+    world.place({name.removeprefix("scene."): x for name, x in starts.items() if name.startswith("scene.")})
+    camera = bundle.contract["camera"] or {"rate": 1, "delay": 0}
+    rate, delay_of_images = camera["rate"], camera["delay"]
+    images: deque[Array] = deque(maxlen=1 - (-delay_of_images // rate))
     pilots = [_pilot(bundle, {k: x[i] for k, x in starts.items()}) for i in range(n)]
-    thrust, rates = bundle.command(bundle._hover)
-    queue = deque([np.tile([thrust, *rates], (n, 1))] * delay)
+    turn = _commanded(bundle, mutant)
+    queue = deque([np.tile(bundle.commanded(bundle._hover), (n, 1))] * delay)
     state, memory = world.state(), bundle.contract["observation_delay"] + 1
     seen = deque([state] * memory, memory)
     flight = {name: np.repeat(x[:, None], steps + 1, 1) for name, x in state.items()}
@@ -124,13 +128,17 @@ def _fly(bundle: Bundle, world: Simulator, judge: Judge, starts: Arrays, delay: 
     alive = np.arange(n)
     for t in range(1, steps + 1):
         if len(alive):
-            command = np.empty((len(alive), 4))
+            command = np.empty((len(alive), len(turn)))
+            if bundle.contract["camera"] and (t - 1) % rate == 0:
+                images.append(world.look())
+            shown = (t - 1) // rate - max((t - 1 - delay_of_images) // rate, 0)  # images since the one that it gets
             for k, i in enumerate(alive):
-                command[k] = _ask(pilots[i], {name: seen[0][name][k] for name in MEASURED}, mutant)
+                now = {name: seen[0][name][k] for name in MEASURED}
+                now |= {"depth": images[-1 - shown][k], "depth_age": 0.0} if images else {}
+                command[k] = _ask(pilots[i], now, mutant)
                 flight["action"][i, t - 1] = pilots[i].action
             queue.append(command)
-            now = queue.popleft()
-            world.step(now[:, 0], now[:, 1:] * mutant.commanded)
+            world.step(queue.popleft() * turn)
             state = world.state()
             for name, x in state.items():
                 flight[name][alive, t:] = x[:, None]
@@ -139,6 +147,7 @@ def _fly(bundle: Bundle, world: Simulator, judge: Judge, starts: Arrays, delay: 
         if not on.all():
             alive = alive[on]
             queue = deque(x[on] for x in queue)
+            images = deque((x[on] for x in images), images.maxlen)
             seen = deque(({k: x[on] for k, x in y.items()} for y in seen), seen.maxlen)
             world.keep(on)
     faults = sum((pilot.faults for pilot in pilots), Counter())
@@ -175,14 +184,21 @@ def _pilot(bundle: Bundle, start: Arrays) -> Bundle:
 
 
 def _ask(pilot: Bundle, state: dict[str, Array], mutant: Mutant) -> Array:
-    """The command (4) of a bundle in a state, N and rad/s."""
+    """The command (k) of a bundle in a state."""
     if not mutant.keeps_queue:
         pilot.queue = np.tile(pilot._hover, (len(pilot.queue), 1))
     attitude = state["quaternion"] * mutant.attitude
     seen = {"quaternion": attitude[list(mutant.quaternion)], "age": 0.0}
     seen["angular_velocity"] = state["angular_velocity"] * mutant.measured
-    thrust, rates = pilot({**state, **seen})
-    return np.array([thrust, *rates])
+    pilot({**state, **seen})
+    return pilot.commanded(pilot.action)
+
+
+def _commanded(bundle: Bundle, mutant: Mutant) -> Array:
+    """The signs of a command (k): those of the three axes, and of yaw the last; thrusts keep theirs."""
+    x, y, z = mutant.commanded
+    control, n = bundle.contract["output"]["control"], len(bundle.action)
+    return np.array({"rotor_thrusts": n * [1.0], "velocity": [x, y, z, z]}.get(control, [1.0, x, y, z]))
 
 
 def as_rollout(flight: Contract) -> TensorDict:

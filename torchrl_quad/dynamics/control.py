@@ -18,7 +18,7 @@ from torch.nn.functional import pad
 from torchrl_quad.airframe import uncontrolled
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.parameters import QuadrotorParams, RawParams
-from torchrl_quad.dynamics.rigid_body import Rotors, drag, drag_moment, gyroscopic_torque, thrust_limits
+from torchrl_quad.dynamics.rigid_body import Rotors, gyroscopic_torque, thrust_limits
 from torchrl_quad.dynamics.vector import (
     Vector,
     cat,
@@ -73,7 +73,6 @@ class FlightController:
         self.mixer = _inverse(self.rotors.allocation[..., :4, :])
         self.thrust_min, self.thrust_max = thrust_limits(nominal)
         self.gain = nominal.inertia * nominal.rate_gain
-        self.knows_moment = bool((nominal.drag_height != 0).any())
         weight = nominal.mass * nominal.gravity
         self.tiny = 1e-6 * weight
         # What a rotor contributes to collective thrust; its limits, and the thrust it has for yaw, in these units.
@@ -123,27 +122,21 @@ class FlightController:
 
     def command(self, setpoint: Any, state: Any, wrench: Vector) -> Vector:
         """Commanded rotor speed (*, n) [rad/s] for a setpoint, the drone's state, and the present wrench."""
-        rates, moment = self.rate_setpoint(setpoint, state.quaternion, state.velocity), None
-        if self.knows_moment:
-            velocity_body = quaternion.rotate_inverse(state.quaternion, state.velocity)
-            moment = drag_moment(drag(velocity_body, self.nominal), self.nominal)
-        return self.rotor_speed(rates, state.angular_velocity, wrench, moment)
+        rates = self.rate_setpoint(setpoint, state.quaternion, state.velocity)
+        return self.rotor_speed(rates, state.angular_velocity, wrench)
 
     def rate_setpoint(self, setpoint: Any, attitude: Vector, velocity: Vector) -> Setpoint:
         """Thrust and body rates for a setpoint, at an attitude (*, 4) and a velocity (*, 3) [m/s], world frame."""
         return setpoint
 
-    def rotor_speed(
-        self, setpoint: Setpoint, angular_velocity: Vector, wrench: Vector, moment: Vector | None = None
-    ) -> Vector:
+    def rotor_speed(self, setpoint: Setpoint, angular_velocity: Vector, wrench: Vector) -> Vector:
         """Commanded rotor speed (*, n) [rad/s] for a setpoint, the body rates (*, 3), and the present wrench.
 
         Torque = J K (desired rate - rate) - D (angular acceleration) + w x J w, where the angular acceleration follows
         from the wrench that nominal rotors exert; the setpoint is held, so that the paper's derivative of the desired
-        rate is zero. The rotors also hold against the moment (*, 3) of a drag above the centre of mass.
+        rate is zero. The moment of a drag above the centre of mass disturbs this loop, as it does any without integral.
         """
         held = gyroscopic_torque(angular_velocity, self.nominal.inertia)
-        held = held if moment is None else held - moment
         acceleration = (wrench[..., 1:4] - held) / self.nominal.inertia
         torque = held.addcmul(self.gain, setpoint.body_rate - angular_velocity)
         torque = torque - self.nominal.rate_damping * acceleration

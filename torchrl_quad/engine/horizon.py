@@ -107,7 +107,7 @@ class _Loop:
             ends = written[unravel_key(("next", key))]
             first = self.before[key] if key in self.before else torch.zeros_like(ends[:, 0])
             fresh = {t: (torch.zeros_like(first), like(done, first)) for t, _, done in restarts}
-            written[key] = _roots(first, ends, fresh, 1)
+            written[key] = _roots(first, ends.transpose(0, 1), fresh, 0).transpose(0, 1)
         if acts.memory:
             no = torch.zeros((len(valid), steps, 1), dtype=torch.bool, device=valid.device)
             fresh = {t: (torch.ones_like(no[:, 0]), done.unsqueeze(1)) for t, _, done in restarts}

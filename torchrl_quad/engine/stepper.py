@@ -178,7 +178,12 @@ class _Horizon(torch.autograd.Function):
         stacked = [_stack(x, 0) for x in zip(*(leaves[:6] for leaves in all_ends), strict=True)]
         ctx.mark_non_differentiable(*stacked[1:3], *stacked[4:6])
         observations = _stack([leaves[6] for leaves in all_ends], 1)
-        return *stacked, observations, *(_stack(x, 1) for x in zip(*entries, strict=True))
+        remembered = memory.values()  # of which a loss reads little: stacked as fast as they can be
+        written = (
+            _stack(x, 0).transpose(0, 1) if i in remembered else _stack(x, 1)
+            for i, x in enumerate(zip(*entries, strict=True))
+        )
+        return *stacked, observations, *written
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:

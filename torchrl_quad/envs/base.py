@@ -260,9 +260,13 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         return draw_frame(self, drones, size)
 
     def rebuilt(self, **changes: Any) -> Any:
-        """The same environment with other arguments, built again: ``env.rebuilt(num_envs=8, wind=None)``."""
-        given: dict[str, Any] = {**self._built_with, "compile": self._stepper.options or self.is_compiled, **changes}
-        return type(self)(**given)
+        """The same environment with other arguments, built again: ``env.rebuilt(num_envs=8, wind=None)``. It flies the
+        same drone, from its own starts."""
+        now = {"compile": self._stepper.options or self.is_compiled, "device": self.device}
+        env = cast(Any, type(self))(**{**self._built_with, **now, **changes})
+        if self.params is not self.nominal:
+            env.set_params(self.params)
+        return env
 
     def _place(self, drone: QuadrotorParams) -> None:
         """Build what holds tensors on the device and in the precision of the environment."""

@@ -49,7 +49,7 @@ class TrackingEnv(QuadrotorEnv):
     ==========================================  ====  =============================================
     observation                                 size  unit
     ==========================================  ====  =============================================
-    next 10 points of the curve - position      30    m, world frame; 0.1 s apart, nearest first
+    next 10 points of the curve - position      30    m, world frame; 0.1, 0.2 to 1.0 s ahead
     10 quaternion                               4     (w, x, y, z), body to world
     velocity                                    3     m/s, world frame
     angular velocity                            3     rad/s, body frame
@@ -117,7 +117,7 @@ class TrackingEnv(QuadrotorEnv):
         phase = torch.linspace(0, 2 * math.pi, 257, device=self.device, dtype=self.dtype)
         points = _checked_points(self.curve, phase, self.start_range)
         low, high = points.amin(0), points.amax(0)
-        self.centre = 0.5 * (low + high)
+        self.curve_points, self.centre = points, 0.5 * (low + high)  # of phases from 0 to 2 pi
         self.half_width = (0.5 * (high - low)[:2] + self.box_margin).clamp_min(self.box_half_width)
         self.ceiling = max(self.box_height, high[2].item() + self.box_margin)
         self.settling_steps = round(self.settling_time / self.control_dt)  # that the tracking error leaves out

@@ -317,8 +317,9 @@ class PlainParts(PlainTanhGaussian):
         written: dict[NestedKey, Tensor] = {}
         if self.memory:
             h = inputs[-1].squeeze(-2)
-            kept += [torch.addmm(bias, y, weight.t()) for y, (weight, bias) in zip((x, h), layers[-3:], strict=False)]
-            recalled = _recall(kept[-2], kept[-1], h)
+            gates, new, own_new = _gates(x, h, *layers[-3:-1])
+            kept += [gates, new, own_new]
+            recalled = _recalled(gates, new, h)
             written["next", MEMORY] = recalled.unsqueeze(-2)
             x = torch.cat((x, recalled), 1)
         kept.append(torch.addmm(layers[-1][1], x, layers[-1][0].t()))
@@ -341,13 +342,17 @@ class PlainParts(PlainTanhGaussian):
         x, of_x = activated[-1][0], grad @ layers[-1][0]
         read, of_kept, of_inputs = [x], [grad], []
         if self.memory:
-            h = inputs[-1].squeeze(-2)
-            recalled, pull = vjp(_recall, *kept[-3:-1], h)[:2]
+            h, (gates, new, own_new) = inputs[-1].squeeze(-2), kept[-4:-1]
             of_x, of_recalled = of_x.split([x.shape[1], h.shape[1]], 1)
-            of_gates, of_own, of_h = pull(of_recalled + grads["next", MEMORY].squeeze(-2))
-            read, of_kept = [x, h, torch.cat((x, recalled), 1)], [of_gates, of_own, grad]
+            of_recalled = of_recalled + grads["next", MEMORY].squeeze(-2)
+            reset, keep = gates.chunk(2, 1)
+            of_new = (of_recalled - of_recalled * keep) * (1.0 - new * new)
+            of_both = torch.cat((of_new * own_new, of_recalled * (h - new)), 1) * ((1.0 - gates) * gates)
+            of_own_new, of_gates = of_new * reset, torch.cat((of_both, of_new), 1)
+            read, of_kept = [x, h, _recalled(gates, new, h)], [of_gates, of_own_new, grad]
             of_x = of_x + of_gates @ layers[-3][0]
-            of_inputs = [(of_h + of_own @ layers[-2][0]).unsqueeze(-2)]
+            of_h = torch.cat((of_both, of_own_new), 1) @ layers[-2][0]
+            of_inputs = [(of_recalled * keep + of_h).unsqueeze(-2)]
         before = [self._read(inputs, seen), *(x for x, _ in activated)]
         for i in reversed(range(len(activated))):
             (grad,) = activated[i][1](of_x)
@@ -363,11 +368,18 @@ class PlainParts(PlainTanhGaussian):
 
     def weight_gradient(self, weights: Sequence[Tensor], traces: Sequence[Tensor]) -> list[Tensor]:
         """The gradients of all weights, over a batch."""
-        if not self.sees:
-            return super().weight_gradient(weights, traces)
-        (image, of_seen, *others), count = traces, 2 * len(self.lenses)
-        pull = vjp(lambda *own: self._see(own, [image])[0], *weights[:count])[1]
-        return [*pull(of_seen), *super().weight_gradient(weights[count:], others)]
+        seen: tuple[Tensor, ...] = ()
+        if self.sees:
+            (image, of_seen, *traces), count = traces, 2 * len(self.lenses)
+            seen = vjp(lambda *own: self._see(own, [image])[0], *weights[:count])[1](of_seen)
+        found = super().weight_gradient(weights, traces)
+        if self.memory:  # whose own layer has the first gradients of the other's, and whose head reads x as well
+            x, h = traces[len(traces) // 2 - 3 :][:2]
+            of_gates, _, grad = traces[-3:]
+            size, (of_bias, own, own_bias, head, bias) = 2 * h.shape[1], found[-5:]
+            own = torch.cat((of_gates[:, :size].t() @ h, own))
+            found[-4:] = own, torch.cat((of_bias[:size], own_bias)), torch.cat((grad.t() @ x, head), 1), bias
+        return [*seen, *found]
 
     def _layers_of(self, weights: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
         """Weight and bias of each layer after the convolutions."""
@@ -388,11 +400,25 @@ class PlainParts(PlainTanhGaussian):
         return concatenated([*seen, *inputs[self.sees : len(inputs) - len(self.memory)]], self.scales)
 
 
-def _recall(of_input: Tensor, of_memory: Tensor, h: Tensor) -> Tensor:
-    """What a GRU recalls (n, k), from its layers' outputs for the input and the memory h, as TorchRL's GRUModule."""
-    (reset, keep, new), (own_reset, own_keep, own_new) = of_input.chunk(3, 1), of_memory.chunk(3, 1)
-    new = (new + (reset + own_reset).sigmoid() * own_new).tanh()
-    return new + (keep + own_keep).sigmoid() * (h - new)
+def _gates(
+    x: Tensor, h: Tensor, of_input: tuple[Tensor, Tensor], of_memory: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The two gates of a GRU, for resets and to keep (n, 2k), the new memory, and the memory's share in it (n, k).
+
+    As in TorchRL's GRUModule. It reads x and the memory h by layers, each a weight and a bias.
+    """
+    size = 2 * h.shape[1]
+    (weight, bias), (own_weight, own_bias) = of_input, of_memory
+    own = torch.addmm(own_bias[:size], h, own_weight[:size].t())
+    own_new = torch.addmm(own_bias[size:], h, own_weight[size:].t())
+    gates, new = torch.addmm(bias, x, weight.t()).split([size, size // 2], 1)
+    gates = (gates + own).sigmoid()
+    return gates, (new + gates[:, : size // 2] * own_new).tanh(), own_new
+
+
+def _recalled(gates: Tensor, new: Tensor, h: Tensor) -> Tensor:
+    """What a GRU recalls (n, k)."""
+    return new + gates[:, h.shape[1] :] * (h - new)
 
 
 class Replay(PlainTanhGaussian):

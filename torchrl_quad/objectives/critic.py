@@ -43,11 +43,7 @@ class PathwiseCriticLoss(PathwiseLoss):
     samples_actions = False  # whether the value of a state is that of an action that the policy samples there
 
     def __init__(
-        self,
-        actor_network: TensorDictModule,
-        *,
-        loss_function: Literal["l2", "l1", "smooth_l1"] = "l2",
-        **kwargs: Any,
+        self, actor_network: TensorDictModule, *, loss_function: Literal["l2", "l1", "smooth_l1"] = "l2", **kwargs: Any
     ) -> None:
         super().__init__(actor_network, **kwargs)
         self.loss_function = loss_function

@@ -186,12 +186,7 @@ class PathwiseLoss(LossModule):
 
     @checked
     def make_value_estimator(
-        self,
-        value_type: Any = None,
-        *,
-        gamma: Fraction | None = None,
-        lmbda: Fraction | None = None,
-        **more: Any,
+        self, value_type: Any = None, *, gamma: Fraction | None = None, lmbda: Fraction | None = None, **more: Any
     ) -> Self:
         """Choose the return estimator and its parameters.
 

@@ -116,6 +116,7 @@ SETTINGS: dict[str, tuple[Any, str]] = {
     "checkpoint": (str, ""),
     "episodes": (Size, "Fresh episodes to fly, side by side."),
     "folder": (str | None, "The folder to write."),
+    "target": (Literal["crazyflie", "px4", "betaflight"] | None, "The firmware to write code for."),
     "logs": (Annotated[list[str], Field(min_length=1)], "The paths of flights of one drone, in a list."),
     "columns": (str | dict[str, Any] | None, "Which columns of the logs are which quantity, as for read_log."),
     "convention": (

@@ -43,7 +43,7 @@ def join(*parts: Primitives) -> Primitives:
 
     def joined(kind: tuple[Tensor, ...]) -> Tensor:
         some = [x for x in kind if x.shape[1]] or [kind[0]]
-        n = max(len(x) for x in kind)
+        n = max(x.shape[0] for x in kind)  # len would be a constant of what is traced
         return some[0] if len(some) == 1 else torch.cat([x.expand(n, *x.shape[1:]) for x in some], 1)
 
     return Primitives(*(joined(kind) for kind in zip(*parts, strict=True)))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_quad.deploy.contract import Contract
-from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Drone
+from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Control, Drone
 from torchrl_quad.errors import MissingPackage, UserValueError, shown
 
 # By name: the module here, its class, and what to install.
@@ -34,23 +34,31 @@ class Simulator:
     version: str  #: name and version
     loops: tuple[str, ...] = tuple(LOOPS)  #: the rate loops that it can fly with
     lacks: frozenset[str] = frozenset()  #: of ``special(drone)``, what it cannot fly
+    sees = False  #: whether it has a camera
 
     def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
         self.substeps = max(round(1000.0 * contract["control_dt"]), 1)
         self.dt = contract["control_dt"] / self.substeps
         nominal, self.drone = Drone(contract["drone"]), Drone(contract["drone"] | contract["plant"])
-        self.loop, self.hover_speed = LOOPS[loop](nominal, self.dt), nominal.hover_speed
+        self.control, self.hover_speed = Control(contract, LOOPS[loop](nominal, self.dt)), nominal.hover_speed
         self.motors = [*motors, *range(len(motors), len(self.hover_speed))]
 
     def reset(self, starts: Mapping[str, Array]) -> None:
         """Begin in these states (n, ...), with the rotors at the nominal hover speed."""
 
+    def place(self, obstacles: Mapping[str, Array]) -> None:
+        """Put up obstacles (n, m, k) by kind. Only a camera sees them: drones fly through, and the judge notices it."""
+
+    def look(self) -> Array:
+        """Images (n, height, width) [m] of the contract's camera, without its noise, rate and delay."""
+        raise NotImplementedError
+
     def state(self) -> dict[str, Array]:
         """``position``, ``quaternion``, ``velocity``, ``angular_velocity`` and ``rotor_speed``, each (n, ...)."""
         raise NotImplementedError
 
-    def step(self, thrust: Array, rates: Array) -> None:
-        """Fly one control step with collective thrusts (n) [N] and body rates (n, 3) [rad/s]."""
+    def step(self, command: Array) -> None:
+        """Fly one control step with commands (n, k), in the contract's ``output.units``."""
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
         """Continue with only these drones (n)."""
@@ -70,15 +78,16 @@ def simulator_class(name: str) -> type[Simulator]:
 def make_simulator(
     name: str, contract: Contract, loop: str = "contract", motors: Sequence[int] = (0, 1, 2, 3)
 ) -> Simulator:
-    """Build a simulator by its name; ValueError where it is unknown, or lacks the rate loop, or the images or obstacles
-    that the policy of the contract needs, ImportError where it is not installed."""
-    task, unjudged = contract["task"]["name"], contract["task"]["unjudged"]
-    if why := "its policy reads images, and they have no camera" if contract["camera"] else unjudged:
+    """Build a simulator by its name; ValueError where it is unknown, or lacks the rate loop, or the camera that the
+    policy of the contract needs, or where the bundle cannot judge, ImportError where it is not installed."""
+    if why := contract["task"]["unjudged"]:
         raise UserValueError(
-            f"The simulators here cannot fly this bundle of the task {task!r}: {why}. Fly it in the package's own "
-            "environment: python recipes/evaluate.py checkpoint=..."
+            f"The simulators here cannot fly this bundle of the task {contract['task']['name']!r}: {why}. Export the "
+            "policy again, or fly it in the package's own environment: python recipes/evaluate.py checkpoint=..."
         )
     kind = simulator_class(name)
+    if contract["camera"] and not kind.sees:
+        raise UserValueError(f"{name} has no camera, and this policy reads images. Fly it in mujoco or torchrl_quad.")
     if loop not in kind.loops:
         raise UserValueError(f"{name} has no rate loop {shown(loop)}. Choose from: {', '.join(kind.loops)}.")
     if cannot := special(contract["drone"] | contract["plant"]) & kind.lacks:
@@ -89,8 +98,9 @@ def make_simulator(
 
 
 def special(drone: Contract) -> frozenset[str]:
-    """In what a drone differs from one with four upright, whole rotors."""
+    """In what a drone differs from one with four upright, whole rotors, and drag at its centre of mass."""
     up, works = np.array(drone.get("rotor_direction", [[0.0, 0.0, 1.0]])), drone.get("rotor_effectiveness", [1.0])
-    found = {"tilted rotors": up[:, :2].any(), "rotors that are not whole": set(works) != {1.0}}
+    found = {"drag_height": drone.get("drag_height", 0.0) != 0.0}
+    found |= {"tilted rotors": up[:, :2].any(), "rotors that are not whole": set(works) != {1.0}}
     found |= {"more than four rotors": len(drone["rotor_spin"]) > 4}
     return frozenset(what for what, has in found.items() if has)

@@ -31,7 +31,7 @@ class Crazyflow(Simulator):
     float32, and hold drones above the ground. Physics and rate loop run at 1 kHz, by symplectic Euler.
     """
 
-    lacks = frozenset({"more than four rotors", "tilted rotors", "rotors that are not whole"})
+    lacks = frozenset({"drag_height", "more than four rotors", "tilted rotors", "rotors that are not whole"})
     version, frame = f"Crazyflow {version('crazyflow')}", frames.crazyflow()
 
     def reset(self, starts: Mapping[str, Array]) -> None:
@@ -62,18 +62,17 @@ class Crazyflow(Simulator):
         speeds = np.asarray(states.rotor_vel, float)[self.flying, 0] / RPM
         return {**self.frame.back(theirs), "rotor_speed": self.frame.back({"motors": speeds})["motors"]}
 
-    def step(self, thrust: Array, rates: Array) -> None:
-        command = np.array(self.sim.data.controls.rotor_vel)
+    def step(self, command: Array) -> None:
+        speeds = np.array(self.sim.data.controls.rotor_vel)
         for _ in range(self.substeps):
-            state = self.state()
-            asked = self.loop(thrust, rates, state["angular_velocity"], state["rotor_speed"])[:, self.motors]
-            command[self.flying, 0] = self.frame.to({"motors": asked})["motors"] * RPM
-            self.sim.rotor_vel_control(jnp.asarray(command))
+            asked = self.control(command, self.state())[:, self.motors]
+            speeds[self.flying, 0] = self.frame.to({"motors": asked})["motors"] * RPM
+            self.sim.rotor_vel_control(jnp.asarray(speeds))
             self.sim.step(1)
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
         self.flying = self.flying[chosen]
-        self.loop.keep(chosen)
+        self.control.keep(chosen)
 
 
 def _parameters(drone: Drone, frame: frames.Convention) -> Fields:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
 from mujoco import rollout
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from torchrl_quad.deploy.contract import Contract
 from torchrl_quad.deploy.simulators import Simulator
 from torchrl_quad.deploy.simulators.vehicle import Array, Drone
+from torchrl_quad.rotations import multiply, rotate
 
+SOLIDS = ("spheres", "cylinders", "boxes", "planes")  # kinds of obstacles
 # qpos of a free joint: position and quaternion (w, x, y, z), body to world. qvel: velocity in the world frame, angular
 # velocity in the body frame. act: the rotor speeds.
 STATE = {"position": slice(1, 4), "quaternion": slice(4, 8), "velocity": slice(8, 11)}
@@ -56,18 +59,32 @@ def model(drone: Drone, timestep: float) -> str:
 </mujoco>"""
 
 
-def _words(numbers: Array) -> str:
-    return " ".join(map(repr, numbers.tolist()))
+def _words(numbers: ArrayLike) -> str:
+    return " ".join(map(repr, np.asarray(numbers, float).tolist()))
+
+
+def scenery(obstacles: Mapping[str, Any]) -> str:
+    """Obstacles by kind, as a contract lists them, as MJCF."""
+    geoms = [("sphere", x[:3], x[3:], "") for x in obstacles["spheres"]]
+    for x, y, z, radius, height in obstacles["cylinders"]:
+        geoms.append(("cylinder", (x, y, z + 0.5 * height), (radius, 0.5 * height), ""))
+    geoms += [("box", x[:3], x[3:6], f'quat="{_words(x[6:])}"') for x in obstacles["boxes"]]
+    for *normal, offset in obstacles["planes"]:
+        geoms.append(("plane", offset * np.array(normal), (0.0, 0.0, 1.0), f'zaxis="{_words(normal)}"'))
+    written = (
+        f'<geom type="{kind}" pos="{_words(at)}" size="{_words(size)}" {turn}/>' for kind, at, size, turn in geoms
+    )
+    return f'<mujoco><size memory="64K"/><worldbody>{"".join(written)}</worldbody></mujoco>'
 
 
 class MuJoCo(Simulator):
     """Independent drones in MuJoCo.
 
     Thrust follows from the speed of the rotors by the contract's thrust map, and drag by its coefficients; both are
-    forces to MuJoCo, held over a step of 1 ms. The rate loop runs at 1 kHz, too.
+    forces to MuJoCo, held over a step of 1 ms. The rate loop runs at 1 kHz, too. Images are cast by its rays.
     """
 
-    version = f"MuJoCo {mujoco.__version__}"
+    version, sees = f"MuJoCo {mujoco.__version__}", True
 
     def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
         super().__init__(contract, loop, motors)
@@ -77,6 +94,8 @@ class MuJoCo(Simulator):
         self.model = mujoco.MjModel.from_xml_string(model(self.drone, self.dt))
         self.data = mujoco.MjData(self.model)
         self.rollout = rollout.Rollout(nthread=0)
+        self.camera, self.fixed = contract["camera"], contract["obstacles"]
+        self.scenes: list[tuple[Any, Any]] = []
         self.inputs = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED)
 
     def reset(self, starts: Mapping[str, Array]) -> None:
@@ -86,31 +105,59 @@ class MuJoCo(Simulator):
             self.x[:, at] = starts.get(name, self.hover_speed)
         self._allocate()
 
+    def place(self, obstacles: Mapping[str, Array]) -> None:
+        if self.camera is None:
+            return
+        for i in range(len(self.x)):
+            own = {kind: [*self.fixed[kind], *obstacles.get(kind, {i: ()})[i]] for kind in SOLIDS}
+            scene = mujoco.MjModel.from_xml_string(scenery(own))
+            self.scenes.append((scene, mujoco.MjData(scene)))
+            mujoco.mj_forward(*self.scenes[-1])
+
+    def look(self) -> Array:
+        camera, state = self.camera, self.state()
+        width, height, far = camera["width"], camera["height"], camera["range"]
+        half = np.tan(0.5 * camera["field_of_view"])
+        left = half * (1.0 - (2.0 * np.arange(width) + 1.0) / width)
+        up = half * (height - 1.0 - 2.0 * np.arange(height)) / width
+        ahead = np.stack(np.broadcast_arrays(1.0, left, up[:, None]), -1).reshape(-1, 3)
+        length = np.linalg.norm(ahead, axis=1)
+        turned = multiply(state["quaternion"], camera["quaternion"])
+        rays = rotate(turned[:, None], ahead / length[:, None])
+        eyes = state["position"] + rotate(state["quaternion"], camera["position"])
+        found, hit = np.empty((len(eyes), len(ahead))), np.empty(len(ahead), np.int32)
+        most = far * (1.0 if camera["along_ray"] else length.max())
+        for (scene, data), eye, ray, ends in zip(self.scenes, eyes, rays, found, strict=True):
+            mujoco.mj_multiRay(scene, data, eye, ray.ravel(), None, 1, -1, hit, ends, None, len(ray), most)
+        depth = np.where(found < 0.0, far, found / (1.0 if camera["along_ray"] else length))
+        return np.minimum(depth, far).reshape(-1, height, width)
+
     def state(self) -> dict[str, Array]:
         return {name: self.x[:, at].copy() for name, at in STATE.items()}
 
-    def step(self, thrust: Array, rates: Array) -> None:
+    def step(self, command: Array) -> None:
         drone, limits = self.drone, (self.drone.rotor_speed_min, self.drone.rotor_speed_max)
-        n, control = len(self.motors), self.control[:, 0]
-        command, lift, force = control[:, :n], control[:, n : 2 * n], control[:, 2 * n + 6 : 2 * n + 9]
+        n, inputs = len(self.motors), self.controls[:, 0]
+        target, lift, force = inputs[:, :n], inputs[:, n : 2 * n], inputs[:, 2 * n + 6 :]
         for _ in range(self.substeps):
             x = self.x
             speed = x[:, STATE["rotor_speed"]]
-            asked = self.loop(thrust, rates, x[:, STATE["angular_velocity"]], speed)
-            np.clip(asked[:, self.motors], *limits, out=command)
+            asked = self.control(command, {name: x[:, at] for name, at in STATE.items()})
+            np.clip(asked[:, self.motors], *limits, out=target)
             if self.pulls.min() < 1.0:
-                command[:] = speed + np.where(command > speed, *self.pulls) * (command - speed)
+                target[:] = speed + np.where(target > speed, *self.pulls) * (target - speed)
             lift[:] = drone.thrust(speed)
-            force[:] = drone.drag(x[:, STATE["quaternion"]], x[:, STATE["velocity"]])
-            self.rollout.rollout(self.model, [self.data], x, self.control, control_spec=self.inputs, state=self.after)
+            force[:] = np.concatenate(drone.drag(x[:, STATE["quaternion"]], x[:, STATE["velocity"]]), 1)
+            self.rollout.rollout(self.model, [self.data], x, self.controls, control_spec=self.inputs, state=self.after)
             self.x, self.after = self.after[:, 0], x[:, None]
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
         self.x = self.x[chosen]
-        self.loop.keep(chosen)
+        self.scenes = [x for x, on in zip(self.scenes, chosen, strict=False) if on]
+        self.control.keep(chosen)
         self._allocate()
 
     def _allocate(self) -> None:
         # Of each drone two controls for each rotor, then force and torque on the world, and on the drone.
-        self.control = np.zeros((len(self.x), 1, 2 * len(self.motors) + 12))
+        self.controls = np.zeros((len(self.x), 1, 2 * len(self.motors) + 12))
         self.after = np.zeros((len(self.x), 1, self.x.shape[1]))

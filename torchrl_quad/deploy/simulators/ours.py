@@ -14,12 +14,14 @@ from torchrl_quad.deploy.simulators import Simulator
 from torchrl_quad.deploy.simulators.vehicle import Array
 from torchrl_quad.dynamics import DYNAMICS, load_drone
 from torchrl_quad.errors import UserValueError, shown
+from torchrl_quad.vision import DepthCamera, Primitives
+from torchrl_quad.vision.primitives import SIZES, join
 
 
 class Ours(Simulator):
     """The simulator of the contract."""
 
-    loops = ("contract",)
+    loops, sees = ("contract",), True
 
     def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
         if list(motors) != sorted(motors):
@@ -33,7 +35,12 @@ class Ours(Simulator):
                 "register those of your own first."
             )
         kind: Any = DYNAMICS[about["dynamics"]]
-        self.dynamics = kind(nominal, about["dt"], substeps, about["integrator"], "rates")
+        output, control = contract["output"], {"mode": contract["output"]["control"]}
+        tilt = output["gains"].get("max_tilt", [output["range"][1][1]])[0]  # in attitude the range of roll
+        control |= {"max_tilt": tilt} if "tilt_gain" in output["gains"] else {}
+        control |= {"max_speed": output["range"][0][1]} if control["mode"] == "velocity" else {}
+        self.dynamics = kind(nominal, about["dt"], substeps, about["integrator"], control)
+        self.camera, self.fixed = contract["camera"], contract["obstacles"]
         flies = contract["drone"] | contract["plant"]
         self.params = load_drone(flies) if contract["plant"] else self.dynamics.nominal
 
@@ -41,14 +48,32 @@ class Ours(Simulator):
         given = {name: torch.from_numpy(x).float() for name, x in starts.items()}
         self.now = {**self.dynamics.rest(given["position"]), **given}
 
+    def place(self, obstacles: Mapping[str, Array]) -> None:
+        fixed, drawn = (
+            Primitives(
+                *(
+                    torch.tensor(np.asarray(x.get(kind, ())), dtype=torch.float32).reshape(n, -1, k)
+                    for kind, k in SIZES.items()
+                )
+            )
+            for n, x in ((1, self.fixed or {}), (len(self.now["position"]), obstacles))
+        )
+        self.solids = join(fixed, drawn)
+
+    def look(self) -> Array:
+        fields = {name: x for name, x in self.camera.items() if name not in ("rate", "delay", "noise", "dropout")}
+        depth = DepthCamera(**fields).depth(self.solids, self.now["position"], self.now["quaternion"])
+        return depth[:, 0].double().numpy()
+
     def state(self) -> dict[str, Array]:
         return {name: x.double().numpy() for name, x in self.now.items()}
 
     @torch.no_grad()
-    def step(self, thrust: Array, rates: Array) -> None:
-        command = torch.cat((torch.from_numpy(thrust)[:, None], torch.from_numpy(rates)), 1).float()
-        action = self.dynamics.controller.encode(command)
+    def step(self, command: Array) -> None:
+        action = self.dynamics.controller.encode(torch.from_numpy(command).float())
         self.now = self.dynamics.control_step(self.now, action, self.params, None)
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
-        self.now = {name: x[torch.from_numpy(chosen)] for name, x in self.now.items()}
+        on, n = torch.from_numpy(chosen), len(chosen)
+        self.now = {name: x[on] for name, x in self.now.items()}
+        self.solids = Primitives(*(x[on] if len(x) == n else x for x in self.solids))

@@ -12,7 +12,7 @@ from rotorpy.vehicles.multirotor import Multirotor
 from torchrl_quad.deploy import frames
 from torchrl_quad.deploy.contract import Contract, Fields
 from torchrl_quad.deploy.simulators import Simulator
-from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Drone
+from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Control, Drone
 
 NAMES = {"position": "x", "quaternion": "q", "velocity": "v", "angular_velocity": "w"}
 
@@ -31,7 +31,10 @@ class RotorPy(Simulator):
     The loop "own" is its ``cmd_ctbr``, proportional, with the gain that gives the damping of the contract's loop.
     """
 
-    loops, lacks = (*LOOPS, "own"), frozenset({"more than four rotors", "tilted rotors", "rotors that are not whole"})
+    loops, lacks = (
+        (*LOOPS, "own"),
+        frozenset({"drag_height", "more than four rotors", "tilted rotors", "rotors that are not whole"}),
+    )
 
     def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
         self.version = f"RotorPy {version('rotorpy')}"
@@ -42,7 +45,7 @@ class RotorPy(Simulator):
         self.drone, self.frame = drone, frames.rotorpy()
         self.hover_speed, self.motors = nominal.hover_speed, list(motors)
         self.own = loop == "own"
-        self.loop = LOOPS["contract" if self.own else loop](nominal, self.dt)
+        self.control = Control(contract, LOOPS["contract" if self.own else loop](nominal, self.dt))
         ratio, tau = nominal.rate_loop(0.0).damping_ratio, nominal.motor_time_constant.mean()  # of continuous time
         gain = float((1.0 / (4.0 * ratio**2 * tau))[:2].mean())
         kind = "cmd_ctbr" if self.own else "cmd_motor_speeds"
@@ -62,14 +65,15 @@ class RotorPy(Simulator):
         speeds = self.frame.back({"motors": np.stack([x["rotor_speeds"] for x in self.now])})["motors"]
         return {**self.frame.back(theirs), "rotor_speed": speeds}
 
-    def step(self, thrust: Array, rates: Array) -> None:
-        rates = self.frame.to({"body_rate": rates})["body_rate"]
+    def step(self, command: Array) -> None:
         for _ in range(self.substeps):
+            state = self.state()
             if self.own:
+                thrust, rates = self.control.rates(command, state)
+                rates = self.frame.to({"body_rate": rates})["body_rate"]
                 commands = [{"cmd_thrust": t, "cmd_w": w} for t, w in zip(thrust, rates, strict=True)]
             else:
-                state = self.state()
-                speeds = self.loop(thrust, rates, state["angular_velocity"], state["rotor_speed"])[:, self.motors]
+                speeds = self.control(command, state)[:, self.motors]
                 commands = [{"cmd_motor_speeds": x} for x in self.frame.to({"motors": speeds})["motors"]]
             self.now = [self._step(x, c) for x, c in zip(self.now, commands, strict=True)]
 
@@ -80,7 +84,7 @@ class RotorPy(Simulator):
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
         self.now = [x for x, on in zip(self.now, chosen, strict=True) if on]
-        self.loop.keep(chosen)
+        self.control.keep(chosen)
 
 
 def _squared(fields: Contract, speed: Array) -> Drone:

@@ -5,12 +5,13 @@ Arrays are (n, ...), one row for each drone. Nothing here imports torch.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_quad.airframe import Array, RateLoop, matrix
 from torchrl_quad.deploy.contract import Contract
-from torchrl_quad.errors import UserValueError
 from torchrl_quad.rotations import cross, rotate, rotate_inverse
 
 
@@ -23,9 +24,6 @@ class Drone:
         thrust_limits: the least and the greatest thrust [N] that may be commanded of one rotor.
         motor_time_constant: of rotors that speed up, and of those that slow down (2) [s].
         hover_speed: of each rotor (n) [rad/s].
-
-    Raises:
-        ValueError: its drag acts above its centre of mass.
     """
 
     mass: float
@@ -46,13 +44,9 @@ class Drone:
 
     def __init__(self, fields: Contract) -> None:
         arrays = {name: np.array(value, float) for name, value in fields.items()}
-        if arrays.get("drag_height", np.zeros(1)).any():
-            raise UserValueError(
-                "Third-party simulators do not fly drones with drag_height. Export the policy of a drone without: "
-                "env.drone with drag_height: 0."
-            )
         for name, value in arrays.items():
             setattr(self, name, value if value.ndim else float(value))
+        self.drag_height = float(arrays.get("drag_height", 0.0))
         self.rotor_effectiveness = arrays.get("rotor_effectiveness", np.ones(len(self.rotor_spin)))
         self.motor_time_constant = np.broadcast_to(self.motor_time_constant, 2)
         k2, k1, k0 = self.thrust_map
@@ -84,10 +78,13 @@ class Drone:
         """The loop of :class:`ContractLoop` about hover, in steps of dt [s]."""
         return RateLoop(self.rate_gain, self.inertia, self.rate_damping, self.motor_time_constant, dt)
 
-    def drag(self, quaternion: Array, velocity: Array) -> Array:
-        """The force of the air (n, 3) [N], world frame, at an attitude (n, 4) and a velocity (n, 3) [m/s]."""
+    def drag(self, quaternion: Array, velocity: Array) -> tuple[Array, Array]:
+        """Force [N] and torque [N m] of the air, world frame, each (n, 3), at an attitude (n, 4) and a velocity (n, 3)
+        [m/s]: the force acts ``drag_height`` above the centre of mass."""
         body = rotate_inverse(quaternion, velocity)
-        return rotate(quaternion, -(self.linear_drag + self.quadratic_drag * np.abs(body)) * body)
+        force = -(self.linear_drag + self.quadratic_drag * np.abs(body)) * body
+        torque = cross(np.array([0.0, 0.0, self.drag_height]), force)
+        return rotate(quaternion, force), rotate(quaternion, torque)
 
 
 class ContractLoop:
@@ -189,6 +186,52 @@ class PDLoop(PIDLoop):
     """The same without the integral, which firmware holds back while the setpoint moves fast."""
 
     integral_share = 0.0
+
+
+class Control:
+    """Follows the commands of a contract by its ``output.law``: an outer loop, where there is one, and a rate loop."""
+
+    def __init__(self, contract: Contract, loop: ContractLoop) -> None:
+        self.output, self.loop = contract["output"], loop
+        self.mode, gains = self.output["control"], self.output["gains"]
+        self.gains = {name: np.array(value) for name, value in gains.items()}
+        self.max_rate, self.most = np.array(self.output["body_rate"]["range"])[:, 1], self.output["thrust"]["range"][1]
+
+    def __call__(self, command: Array, state: Mapping[str, Array]) -> Array:
+        """Rotor speeds (n, m) [rad/s] to ask for, for commands (n, k) in a state of this moment (n, ...)."""
+        if self.mode == "rotor_thrusts":
+            return self.loop.drone.speed(np.clip(command, *self.loop.drone.thrust_limits))
+        return self.loop(*self.rates(command, state), state["angular_velocity"], state["rotor_speed"])
+
+    def rates(self, command: Array, state: Mapping[str, Array]) -> tuple[Array, Array]:
+        """Collective thrusts (n) [N] and body rates (n, 3) [rad/s] for commands (n, k)."""
+        if self.mode == "rates":
+            return command[:, 0], command[:, 1:]
+        up = rotate_inverse(state["quaternion"], np.array([0.0, 0.0, 1.0]))
+        yaw, gravity = command[:, 3:], self.loop.drone.gravity
+        if self.mode == "attitude":
+            (roll, pitch), level = command[:, 1:3].T, np.cos(command[:, 2])
+            wanted = np.stack((-np.sin(pitch), np.sin(roll) * level, np.cos(roll) * level), 1)
+            return command[:, 0], np.c_[self._tilt(cross(wanted, up)[:, :2]) + yaw * up[:, :2], yaw * up[:, 2:]]
+        error = self.gains["velocity_gain"] * (command[:, :3] - state["velocity"])
+        climb = _limited(error[:, 2:], self.gains["max_climb"]) + gravity
+        reach = climb * np.tan(self.gains["max_tilt"])
+        sideways = error[:, :2] / np.sqrt(1.0 + (error[:, :2] ** 2).sum(1, keepdims=True) / reach**2)
+        wanted = rotate_inverse(state["quaternion"], np.c_[sideways, climb])
+        x, y = (wanted / np.linalg.norm(wanted, axis=1, keepdims=True))[:, :2].T
+        thrust = np.clip(wanted[:, 2] * self.loop.drone.mass, 0.0, self.most)
+        return thrust, np.c_[self._tilt(np.stack((-y, x), 1)), yaw * up[:, 2:]]
+
+    def _tilt(self, error: Array) -> Array:
+        return _limited(self.gains["tilt_gain"] * error, self.max_rate[:2])
+
+    def keep(self, chosen: NDArray[np.bool_]) -> None:
+        """Continue with only these drones (n)."""
+        self.loop.keep(chosen)
+
+
+def _limited(x: Array, limit: Array) -> Array:
+    return x / np.sqrt(1.0 + (x / limit) ** 2)
 
 
 LOOPS: dict[str, type[ContractLoop]] = {"contract": ContractLoop, "pid": PIDLoop, "pd": PDLoop}

@@ -89,13 +89,23 @@ $layers
     return broken;
 }
 
-void policy_command(const float action[POLICY_ACTION], float *thrust, float body_rate[3])
+void policy_command(const float action[POLICY_ACTION], float command[POLICY_ACTION])
 {
-    static const float max_rate[3] = {$max_rates};
+    static const float middle[POLICY_ACTION] = {$middle};
+    static const float half[POLICY_ACTION] = {$half};
 
-    *thrust = 0.5f * (action[0] + 1.0f) * $max_thrust;
-    for (int i = 0; i < 3; ++i) body_rate[i] = action[i + 1] * max_rate[i];
+    for (int i = 0; i < POLICY_ACTION; ++i) command[i] = middle[i] + half[i] * action[i];
 }
+
+@rotors void policy_signal(const float command[POLICY_ACTION], float signal[POLICY_ACTION])
+@rotors {
+@rotors     for (int i = 0; i < POLICY_ACTION; ++i) {
+@rotors         const float thrust = fminf(fmaxf(command[i], $least), $most);
+@rotors         const float share = $signal_0 + $per_speed * sqrtf(fmaxf((thrust - $thrust_0) * $bend, 0.0f));
+@rotors         signal[i] = fminf(fmaxf(share, 0.0f), 1.0f);
+@rotors     }
+@rotors }
+@rotors
 
 static const float test_observation[VECTORS * POLICY_OBSERVATION] = {
 $test_observation

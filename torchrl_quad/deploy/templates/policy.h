@@ -13,7 +13,7 @@ extern "C" {
 #define POLICY_OBSERVATION $observation /* floats that the network reads */
 @depth #define POLICY_DEPTH $depth /* floats of an image: $rows rows of $columns */
 @memory #define POLICY_MEMORY $memory /* floats that the network keeps */
-#define POLICY_ACTION 4 /* floats that it writes: thrust, roll rate, pitch rate, yaw rate, each in -1..1 */
+#define POLICY_ACTION $actions /* floats that it writes, each in -1..1 */
 #define POLICY_CONTROL_DT $control_dt /* s, between two calls */
 #define POLICY_ACTION_DELAY $action_delay /* control steps between a call and its effect, as trained */
 
@@ -29,8 +29,12 @@ extern const float policy_hover_action[POLICY_ACTION];
  */
 int policy_action(const float observation[POLICY_OBSERVATION],$parameters float action[POLICY_ACTION]);
 
-/* What an action commands: collective thrust [N] and body rates [rad/s], body frame x forward, y left, z up. */
-void policy_command(const float action[POLICY_ACTION], float *thrust, float body_rate[3]);
+/* What an action commands: $names; body frame x forward, y left, z up. */
+void policy_command(const float action[POLICY_ACTION], float command[POLICY_ACTION]);
+
+@rotors /* The same as motor signals, from 0 at the least rotor speed to 1 at the greatest, linear in the speed. */
+@rotors void policy_signal(const float command[POLICY_ACTION], float signal[POLICY_ACTION]);
+@rotors
 
 /* The greatest error over the built-in vectors. Fly only if it is below 1e-5 on the processor that flies. */
 float policy_self_test(void);

@@ -27,7 +27,17 @@ def contract(drone="small_racer", **changes):
     fields = yaml.safe_load((PRESETS / f"{drone}.yaml").read_text()) | changes
     fields.pop("motor_command", None)
     simulator = {"dynamics": "betaflight", "dt": 0.0025, "integrator": "semi_implicit_euler"}
-    about = {"drone": fields, "plant": {}, "camera": None, "control_dt": 0.02, "rate_loop": {}, "simulator": simulator}
+    about = {
+        "drone": fields,
+        "plant": {},
+        "camera": None,
+        "obstacles": None,
+        "control_dt": 0.02,
+        "rate_loop": {},
+        "simulator": simulator,
+    }
+    ranges = {"body_rate": {"range": [[-x, x] for x in fields["max_body_rate"]]}, "thrust": {"range": [0.0, 9.81]}}
+    about["output"] = {"control": "rates", "gains": {}, **ranges}
     return {**about, "task": {"name": "racing", "unjudged": ""}, "origin": {"package": "torchrl_quad"}}
 
 
@@ -160,7 +170,7 @@ def test_it_fails_loudly_and_leaves_no_process(changes, said, module, monkeypatc
         refuses(said, world.reset, starts, error=UserError)
         return
     world.reset(starts)
-    world.step(np.full(2, 2.0), np.zeros((2, 3)))
+    world.step(np.array([[2.0, 0.0, 0.0, 0.0]] * 2))
     pids = [process.process.pid for process in world.firmware.flying]
     assert len(pids) == 2 and (world.state()["velocity"][:, 2] > 0.0).all()  # half of the signal is more than hover
     del world
@@ -184,7 +194,7 @@ def flown(simulator, loop="contract", dynamics="betaflight"):
     still = {name: np.zeros((n, 3)) for name in ("position", "velocity", "angular_velocity")}
     world.reset(still | {"quaternion": np.tile(np.eye(4)[0], (n, 1))})
     for rates, thrust in zip(commands, weights, strict=True):
-        world.step(thrust * about["drone"]["mass"] * 9.81, rates)
+        world.step(np.c_[thrust * about["drone"]["mass"] * 9.81, rates])
         found.append(world.state()["angular_velocity"] / most)
     return np.array(found)
 

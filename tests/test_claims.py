@@ -272,6 +272,7 @@ def test_the_readme_says_how_many_episodes_are_solved_in_a_third_party_simulator
     columns = [
         *(("shipped", "torchrl_quad", "contract"), ("shipped", "MuJoCo", "contract")),
         *(("shipped", "MuJoCo", "pid"), ("random", "MuJoCo", "pid")),
+        ("visfly", "Betaflight", "own"),
     ]
     for task in ("hovering", "tracking", "landing", "racing"):
         cells = [f"{100 * solved[(task, *column)]:.3g} %" for column in columns]

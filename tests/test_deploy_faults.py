@@ -74,7 +74,8 @@ def test_each_fault_has_a_name_and_changes_nothing_or_hovers_and_is_counted(task
         raising(state)
     assert raising.faults == {kind.__name__: 1}
     thrust, rates = hovering(state)
-    assert (thrust, *rates) == pytest.approx((0.46 * 9.81, 0, 0, 0))
+    weight = hovering.contract["output"]["thrust"]["weight"]
+    assert (thrust, *rates) == pytest.approx((weight, 0, 0, 0))
     assert hovering.faults == {kind.__name__: 1} and isinstance(hovering.last_fault, kind)
     np.testing.assert_allclose(hovering.queue[-1], hovering.contract["output"]["hover_action"])
     np.testing.assert_array_equal(raising.queue, untouched.queue)
@@ -158,8 +159,9 @@ def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch, trace_once):
         strongest = HoveringEnv(num_envs=2, max_episode_steps=4, drone=strong)
     said = r"export_policy: output.thrust.range_in_weights.1.: 30.0 is greater than the maximum of 20. A bundle flies"
     refuses(said, env=strongest)
-    other = HoveringEnv(num_envs=2, control="attitude")
-    refuses("exports thrust and body rates, control=\"rates\"; got 'attitude'", env=other)
+    other = HoveringEnv(num_envs=2, max_episode_steps=8)
+    other.dynamics.controller.action_units = {"thrust": "N", "throttle": "1"}
+    refuses("exports the controls rates, attitude, velocity, rotor_thrusts; got 'rates'", env=other)
     of_an_error = ObservationNormalizer(env, ("metrics", "position_error"))
     refuses('the normalizer must be that of "observation", got ', normalizer=of_an_error)
     refuses("needs an environment of this package, got PendulumEnv", env=PendulumEnv())
@@ -329,7 +331,7 @@ def test_the_recipe_exports_the_best_policy_with_results_and_a_page(train, launc
     assert about["memory"] > 0 and about["camera"]["range"] == 10.0
     assert environment_beside(load_bundle(tmp_path / "policy")).camera.width == 6
     assert environment_beside(load_bundle(export_once("hovering")[2])) is None
-    assert re.search(r"forest +\w+ +MuJoCo", launch("transfer", f"bundle={tmp_path}/policy", "episodes=2", "loop=pid"))
+    assert re.search(r"forest +MuJoCo", launch("transfer", f"bundle={tmp_path}/policy", "episodes=2", "loop=pid"))
     assert "folder is unknown" not in refused("export", f"checkpoint={tmp_path}/none.pt")
     assert "episodes=0" in refused("export", f"checkpoint={tmp_path}/checkpoint.pt", "episodes=0")
     assert contract.schema_table() in (export_once("forest")[2] / "README.md").read_text()

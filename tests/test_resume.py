@@ -130,7 +130,7 @@ def test_what_the_command_line_says_must_agree_with_the_checkpoint(train, refuse
     assert f"{tmp_path} holds another run. Continue with it, resume={tmp_path}/checkpoint.pt, or choose another" in said
     for words, message in {
         "bptt env.drone=small_racer": "env.drone=small_racer contradicts the checkpoint .*trained with env.drone=visf",
-        "bptt tuned=bptt_racing": "num_envs=.* contradicts the checkpoint",
+        "bptt tuned=bptt_racing": "gamma=.* contradicts the checkpoint",
         "bptt algorithm=shac": "algorithm=shac: this recipe is bptt",
         "shac": "algorithm=shac contradicts the checkpoint .*trained with algorithm=bptt",
     }.items():

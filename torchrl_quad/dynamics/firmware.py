@@ -34,13 +34,10 @@ class FirmwareController(FlightController):
         self.per_slope = 1.0 / (2.0 * k2 * self.hover_speed.mean(-1, keepdim=True) + k1)  # [rad/s per N]
         self.span = nominal.rotor_speed_max - nominal.rotor_speed_min
 
-    def rotor_speed(
-        self, setpoint: Setpoint, angular_velocity: Vector, wrench: Vector, moment: Vector | None = None
-    ) -> Vector:
+    def rotor_speed(self, setpoint: Setpoint, angular_velocity: Vector, wrench: Vector) -> Vector:
         """As for the loop of training, of which it only sees the gyro. Where the torques need more than the whole range
         they shrink, all alike; the throttle moves to make room for them (airmode)."""
         held = gyroscopic_torque(angular_velocity, self.nominal.inertia)
-        held = held if moment is None else held - moment
         acceleration = (wrench[..., 1:4] - held) / self.nominal.inertia
         torque = self.gain * (setpoint.body_rate - angular_velocity) - self.nominal.rate_damping * acceleration
         mix = matvec(self.mixer, cat(setpoint.thrust * 0.0, torque)) * self.per_slope

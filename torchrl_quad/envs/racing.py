@@ -42,8 +42,7 @@ class RacingEnv(QuadrotorEnv):
     ==========================================  ====  =============================================
     next gate - position                        3     m, world frame
     gate after that - position                  3     m, world frame
-    10 direction of the next gate               3     world frame; with ``observe_directions``
-    10 direction of the gate after that         3     world frame; with ``observe_directions``
+    10 directions of these two gates            6     world frame; with ``observe_directions``
     10 way to the planes of these two gates     2     m, at most 1 to both sides; with ``observe_directions``
     10 quaternion                               4     (w, x, y, z), body to world
     velocity                                    3     m/s, world frame

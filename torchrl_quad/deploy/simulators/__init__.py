@@ -82,9 +82,8 @@ def make_simulator(
     policy of the contract needs, or where the bundle cannot judge, ImportError where it is not installed."""
     if why := contract["task"]["unjudged"]:
         raise UserValueError(
-            f"The simulators here cannot fly this bundle of the task {contract['task']['name']!r}: {why}. With "
-            "obstacles, export again. Fly others in the package's own environment: "
-            "python recipes/evaluate.py checkpoint=..."
+            f"The simulators here cannot fly this bundle of the task {contract['task']['name']!r}: {why}. Fly it in "
+            "the package's own environment: python recipes/evaluate.py checkpoint=..."
         )
     kind = simulator_class(name)
     if contract["camera"] and not kind.sees:

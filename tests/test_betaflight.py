@@ -37,7 +37,9 @@ def contract(drone="small_racer", **changes):
         "simulator": simulator,
     }
     ranges = {"body_rate": {"range": [[-x, x] for x in fields["max_body_rate"]]}, "thrust": {"range": [0.0, 9.81]}}
-    about["output"] = {"control": "rates", "gains": {}, **ranges}
+    every = [ranges["thrust"]["range"], *ranges["body_rate"]["range"]]
+    about["output"] = {"control": "rates", "gains": {}, "range": every, **ranges}
+    about |= {"camera": None, "obstacles": None}
     return {**about, "task": {"name": "racing", "unjudged": ""}, "origin": {"package": "torchrl_quad"}}
 
 

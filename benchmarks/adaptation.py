@@ -54,7 +54,7 @@ class Changed(MuJoCo):
         body = f'<inertial pos="{" ".join(map(str, centre))}" mass="{mass}" fullinertia="{whole}"/>'
         self.model = mujoco.MjModel.from_xml_string(re.sub("<inertial .*/>", body, model(drone, self.dt)))
         self.model.actuator_gear[len(drone.rotor_spin) + random.integers(4)] *= 0.8
-        self.data, self.samples, loop, still = mujoco.MjData(self.model), [], self.loop, drone.drag
+        self.data, self.samples, loop, still = mujoco.MjData(self.model), [], self.control.loop, drone.drag
 
         def recorded(*asked: Any) -> Any:
             command = np.clip(loop(*asked), drone.rotor_speed_min, drone.rotor_speed_max)
@@ -66,7 +66,7 @@ class Changed(MuJoCo):
             return still(quaternion, velocity - wind * np.clip(0.7 + 0.2 * height, 0.0, 2.0))
 
         recorded.keep = loop.keep
-        self.loop, drone.drag = recorded, blown
+        self.control.loop, drone.drag = recorded, blown
 
     def log(self, seed: int) -> FlightLog:
         """The flight of the first drone, as its sensors measured it."""

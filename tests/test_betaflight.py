@@ -17,6 +17,7 @@ from small_runs import ROOT
 
 from torchrl_quad.deploy import autopilots, frames, load_bundle
 from torchrl_quad.deploy.simulators import make_simulator
+from torchrl_quad.deploy.simulators.vehicle import Drone
 from torchrl_quad.errors import UserError
 
 PRESETS = resources.files("torchrl_quad.dynamics") / "drones"
@@ -76,7 +77,7 @@ def test_gains_by_hand_in_the_units_of_each_autopilot():
 @cases(("small_racer", 0.01), ("visfly", 0.02), ("x500", 0.01), ("flightmare", 0.6))
 def test_the_throttle_hovers_and_is_near_over_the_thrusts_that_are_commanded(drone, error):
     """The thrust map of flightmare falls at first, which no such curve does."""
-    nominal = autopilots.nominal(contract(drone))
+    nominal = Drone(contract(drone)["drone"])
     idle = autopilots.idle(nominal)
     curve, target = autopilots.throttle(nominal, idle), frames.betaflight(min_check=1050, motor_idle=idle)
     low, high = nominal.rotor_speed_min, nominal.rotor_speed_max

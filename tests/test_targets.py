@@ -7,6 +7,7 @@ import pytest
 from deploying import resting
 
 from torchrl_quad.deploy import autopilots, frames, load_bundle
+from torchrl_quad.deploy.simulators.vehicle import Drone
 from torchrl_quad.deploy.targets import TARGETS, write_target
 
 STATE = resting(position=[0.3, -0.2, 1.1], quaternion=[0.8, 0.2, -0.4, 0.4], velocity=[0.5, -0.3, 0.2])
@@ -87,7 +88,7 @@ def test_code_for_a_firmware_compiles_and_commands_what_the_bundle_does(target, 
     if target == "crazyflie":
         expected = expected * (1, -1, -1)  # cflib turns both signs
     if target == "betaflight":
-        nominal, stick = autopilots.nominal(bundle.contract), autopilots.stick_rate(bundle.contract)
+        nominal, stick = Drone(bundle.contract["drone"]), autopilots.stick_rate(bundle.contract)
         idle = autopilots.idle(nominal)
         throttle = frames.betaflight(min_check=autopilots.MIN_CHECK, motor_idle=idle)
         command = throttle.thrust(thrust, *autopilots.throttle(nominal, idle)[:2])

@@ -112,9 +112,8 @@ class Flown(NamedTuple):
         found = {key: leaf(entries, key) for key in map(unravel_key, base.state_keys)}
         wanted = {*spec, *self.memory}
         values = [(key, value) for key, value in self.known.items() if value is not None and key in given]
-        for key, value in sorted(
-            values, key=lambda pair: pair[1].kind != "entry"
-        ):  # what is there as it was comes first
+        values.sort(key=lambda pair: pair[1].kind != "entry")  # what is there as it was comes first
+        for key, value in values:
             if not wanted.isdisjoint(value.sources()):
                 value.undo(given[key], found, spec)
         if not spec.keys() <= found.keys():  # a transform leaves some out

@@ -32,23 +32,17 @@ class Throttle(NamedTuple):
     hover: float  #: the signal that hovers
 
 
-def files(contract: Contract) -> dict[str, str]:
-    """The parameters that go with a bundle by the names of their files; none unless it flies an X quadrotor."""
+def fit(contract: Contract) -> bool:
+    """Whether there are parameters for a contract: of an X quadrotor whose rotors lag."""
     drone = contract["drone"]
     tilted = any(up[:2] != [0.0, 0.0] for up in drone.get("rotor_direction", []))
-    if (
-        contract["rate_loop"] is None
-        or len(drone["rotor_spin"]) != 4
-        or not quarters(drone["rotor_positions"])
-        or tilted
-    ):
-        return {}
-    return dict(zip(AUTOPILOTS, (betaflight(contract), px4(contract), crazyflie(contract)), strict=True))
+    return contract["rate_loop"] is not None and bool(quarters(drone["rotor_positions"])) and not tilted
 
 
-def nominal(contract: Contract) -> Drone:
-    """The drone that a rate loop believes in; it knows nothing of the drag."""
-    return Drone({**contract["drone"], "drag_height": 0.0})
+def files(contract: Contract) -> dict[str, str]:
+    """The parameters that go with a bundle by the names of their files, where they fit."""
+    written = (betaflight(contract), px4(contract), crazyflie(contract)) if fit(contract) else ()
+    return dict(zip(AUTOPILOTS, written, strict=False))
 
 
 def throttle(drone: Drone, idle: float) -> Throttle:
@@ -87,8 +81,9 @@ def stick_rate(contract: Contract) -> int:
 
 def betaflight(contract: Contract) -> str:
     """``betaflight.txt``: lines for the command line of Betaflight 4.6, with their reasons."""
-    drone, rate = nominal(contract), stick_rate(contract)
-    curve, least = throttle(drone, idle(drone)), idle(drone)
+    drone, rate = Drone(contract["drone"]), stick_rate(contract)
+    least = idle(drone)
+    curve = throttle(drone, least)
     slope = 2.0 * drone.thrust_map[0] * (drone.hover_speed.mean() - drone.vertex_speed)  # of a rotor [N s/rad]
     found = gains(drone, slope * (drone.rotor_speed_max - drone.rotor_speed_min)) * 1000.0 / frames.DEGREES
     found /= np.outer((1.0, 1.0, 1.0), (0.032029, 0.244381, 0.000529))  # PTERM_SCALE, ITERM_SCALE, DTERM_SCALE
@@ -120,7 +115,7 @@ def betaflight(contract: Contract) -> str:
 def px4(contract: Contract) -> str:
     """``px4.params`` of QGroundControl. One unit of roll or pitch changes motors by 1 / sqrt(2) of their thrust, the
     larger one of both where levers differ, and one of yaw by 1; PX4 undoes the thrust curve."""
-    drone = nominal(contract)
+    drone = Drone(contract["drone"])
     curve, lever = throttle(drone, 0.0), np.abs(drone.allocation[1:3]).sum(1)
     unit = 0.25 * curve.full_thrust * np.array([*(0.5**0.5 * lever.min() / lever), 1.0])
     values = {
@@ -137,7 +132,7 @@ def px4(contract: Contract) -> str:
 def crazyflie(contract: Contract) -> str:
     """``crazyflie.txt``: parameters of its rate controller, whose output adds to the thrust command of each motor, half
     of it about roll and pitch."""
-    drone = nominal(contract)
+    drone = Drone(contract["drone"])
     found = gains(drone, drone.thrust_limits[1] / 65535.0 * np.array([0.5, 0.5, 1.0])) / frames.DEGREES
     lines = [f"flightmode.stabMode{axis.capitalize()}=0\n" for axis in AXES]
     for axis, row in zip(AXES, found, strict=True):

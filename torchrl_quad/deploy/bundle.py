@@ -70,6 +70,7 @@ class Bundle:
         self._limits, self._camera, self._dtype = contract["limits"], contract["camera"], contract["task"]["dtype"]
         low, high = np.array(contract["output"]["range"]).T
         self._middle, self._half = 0.5 * (low + high), 0.5 * (high - low)
+        self._drone = Drone(contract["drone"])
         self.reset()
 
     def reset(self, **entries: Any) -> None:
@@ -146,9 +147,8 @@ class Bundle:
         """The pair that an action (k) commands, as a call returns it."""
         control, x = self.contract["output"]["control"], self.commanded(action)
         if control == "rotor_thrusts":
-            drone = Drone(self.contract["drone"])
-            low, high = drone.rotor_speed_min, drone.rotor_speed_max
-            return x, (drone.speed(np.clip(x, *drone.thrust_limits)) - low) / (high - low)
+            low, high = self._drone.rotor_speed_min, self._drone.rotor_speed_max
+            return x, (self._drone.speed(np.clip(x, *self._drone.thrust_limits)) - low) / (high - low)
         return (x[:3], float(x[3])) if control == "velocity" else (float(x[0]), x[1:])
 
     def commanded(self, action: NDArray[Any]) -> NDArray[np.float64]:

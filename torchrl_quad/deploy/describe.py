@@ -360,7 +360,7 @@ def write_page(contract: Contract, documentation: str | None) -> bytes:
         ray, axis = "the length of its ray to", "the depth, along the optical axis, of"
         values["camera_pixel"] = ray if camera["along_ray"] else axis
     features = [name for name in ("camera", "memory") if contract[name]]
-    features += ["autopilots"] if autopilots.files(contract) else []
+    features += ["autopilots"] if autopilots.fit(contract) else []
     features += ["advance"] if "advance" in graphs else []
     features += [] if task["unjudged"] else ["judged"]
     return fill_in("README.md", values, features).encode()

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from torchrl_quad.deploy import autopilots, frames
 from torchrl_quad.deploy.contract import Contract, sha256
 from torchrl_quad.deploy.simulators.mujoco import MuJoCo
-from torchrl_quad.deploy.simulators.vehicle import Array, ContractLoop
+from torchrl_quad.deploy.simulators.vehicle import Array, ContractLoop, Drone
 from torchrl_quad.errors import MissingPackage, Unsupported, UserValueError, WrongState
 from torchrl_quad.files import locked, make_folder, replacing_folder
 
@@ -82,11 +82,11 @@ class Firmware(ContractLoop):
     def __init__(self, contract: Contract, dt: float, stock: bool) -> None:
         self.program = firmware()
         self.version = self.program.name.split("_")[1]
-        settings = autopilots.files(contract).get("betaflight.txt")
-        if settings is None:
+        if not autopilots.fit(contract):
             raise UserValueError("betaflight flies only X quadrotors, whose rotors lag. Fly this one in mujoco.")
+        settings = autopilots.betaflight(contract)
         self.settings = settings.partition(autopilots.TUNE)[0] if stock else settings
-        self.drone, self.dt = autopilots.nominal(contract), dt
+        self.drone, self.dt = Drone(contract["drone"]), dt
         self.idle, self.full_stick = autopilots.idle(self.drone), autopilots.stick_rate(contract)
         self.curve = autopilots.throttle(self.drone, self.idle)[:2]
         convention = frames.betaflight(sitl=True, min_check=autopilots.MIN_CHECK, motor_idle=self.idle)

@@ -9,7 +9,6 @@ noisy. Rows that are in the table are not flown again.
 
 from __future__ import annotations
 
-import csv
 import re
 import tempfile
 from pathlib import Path
@@ -27,6 +26,7 @@ from torchrl_quad.deploy.simulators.mujoco import STATE, MuJoCo, model
 from torchrl_quad.deploy.simulators.vehicle import Drone
 from torchrl_quad.deploy.transfer import Mutant, _fly
 from torchrl_quad.dynamics import MotorCommand
+from torchrl_quad.files import read_rows
 from torchrl_quad.identification import FlightLog
 from torchrl_quad.render.canvas import BLUE, INK, make_figure
 from torchrl_quad.render.canvas import save as write_picture
@@ -136,7 +136,7 @@ def draw(rows: list[dict[str, Any]], path: str) -> None:
 
 def main() -> None:
     options = command_line(__doc__, "adaptation.csv", base="", others=[""], seeds=[0, 1, 2], picture="")
-    rows = list(csv.DictReader(options.output.open())) if options.output.exists() else []
+    rows: list[dict[str, Any]] = [*read_rows(options.output)]
     done = {(x["policy"], int(x["seed"])) for x in rows}
     about = {"flights": FLIGHTS, "episodes": EPISODES}
     with tempfile.TemporaryDirectory() as folder:

@@ -16,6 +16,7 @@ from torchrl_quad.errors import shown
 Array = NDArray[np.float64]
 AXES = np.array(["thrust", "roll", "pitch", "yaw"])
 NEARLY_LINEAR = 1e-3  # of a thrust map, k2 / k1 times the highest speed, below which single precision loses the speed
+INTEGRAL_SHARE = 0.1  # an integral as firmware has it: I is P times this share of the bandwidth without it
 
 JUDGED = ("mass", "inertia", "rotor_positions", "thrust_map", "rotor_speed_min", "rotor_speed_max")
 

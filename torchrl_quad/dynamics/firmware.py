@@ -8,15 +8,15 @@ from typing import Any
 
 import torch
 
-from torchrl_quad.airframe import RateLoop
+from torchrl_quad.airframe import INTEGRAL_SHARE
 from torchrl_quad.dynamics.control import FlightController, Setpoint
+from torchrl_quad.dynamics.gains import rate_loop
 from torchrl_quad.dynamics.model import Quadrotor
 from torchrl_quad.dynamics.parameters import QuadrotorParams
 from torchrl_quad.dynamics.rigid_body import gyroscopic_torque
 from torchrl_quad.dynamics.vector import Vector, cat, clamp, larger, matvec, smaller
 from torchrl_quad.errors import UserValueError
 
-INTEGRAL_SHARE = 0.1  # of the bandwidth of the loop without it, as in betaflight.txt
 RELAX_CUTOFF = 15.0  # [Hz], iterm_relax_cutoff
 RELAX_THRESHOLD = math.radians(40.0)  # [rad/s], by which a setpoint that leaves its mean stops the integral
 
@@ -26,10 +26,7 @@ class FirmwareController(FlightController):
 
     def __init__(self, nominal: QuadrotorParams) -> None:
         super().__init__(nominal)
-        fields = ("rate_gain", "inertia", "rate_damping", "motor_time_constant")
-        gain, inertia, damping, lag = (getattr(nominal, k).detach().cpu().numpy() for k in fields)
-        bandwidth = RateLoop(gain, inertia, damping, lag, 0.0).bandwidth
-        self.integral_rate = torch.as_tensor(INTEGRAL_SHARE * bandwidth).to(self.gain)  # (3) [1/s]
+        self.integral_rate = torch.as_tensor(INTEGRAL_SHARE * rate_loop(nominal, 0.0).bandwidth).to(self.gain)  # [1/s]
         k2, k1, _ = nominal.thrust_map.split(1, -1)
         self.per_slope = 1.0 / (2.0 * k2 * self.hover_speed.mean(-1, keepdim=True) + k1)  # [rad/s per N]
         self.span = nominal.rotor_speed_max - nominal.rotor_speed_min

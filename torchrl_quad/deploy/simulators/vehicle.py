@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_quad.airframe import Array, RateLoop, matrix
+from torchrl_quad.airframe import INTEGRAL_SHARE, Array, RateLoop, matrix
 from torchrl_quad.deploy.contract import Contract
 from torchrl_quad.rotations import cross, rotate, rotate_inverse
 
@@ -153,7 +153,7 @@ class PIDLoop(ContractLoop):
     """
 
     cutoff = 100.0  # [Hz], of the derivative
-    integral_share = 0.1  # of the bandwidth
+    integral_share = INTEGRAL_SHARE
 
     def __init__(self, drone: Drone, dt: float) -> None:
         super().__init__(drone, dt)

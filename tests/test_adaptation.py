@@ -13,6 +13,7 @@ from benchmarks import adaptation as benchmark
 from torchrl_quad import GeometricController, HoveringEnv, make_actor, make_visual_actor
 from torchrl_quad.adaptation import Adapter, adapt, fit_flight, simulated_log
 from torchrl_quad.adaptation.fit import wind_at
+from torchrl_quad.deploy import load_bundle
 from torchrl_quad.dynamics import MotorCommand
 from torchrl_quad.files import read_rows
 from torchrl_quad.training.checkpoints import read_checkpoint
@@ -134,6 +135,9 @@ def test_the_recipe_writes_a_policy_a_bundle_and_a_page_and_leaves_the_checkpoin
     assert any((x != new[name]).any() for name, x in read_checkpoint(checkpoint)["best"]["actor"].items())
     page = (folder / "report.html").read_text()
     assert "What is not covered" in page and page.count("data:image/png") == 2 and "http" not in page
+    flight, world = benchmark.fly(load_bundle(folder / "policy"), 3, 0, 1)  # the bundle meets what the benchmark does
+    steps = int(flight["done"][0].argmax()) + 1
+    assert len(world.samples) == 20 * steps == benchmark.LOGGED * len(world.log(0).time)
 
 
 @pytest.mark.slow

@@ -16,133 +16,122 @@ STATES = [
     {"position": [0.3, -0.2, 1.1], "quaternion": [0.8, 0.2, -0.4, 0.4], "velocity": [0.5, -0.3, 0.2]},
     {"position": [1.4, 0.6, 1.3], "quaternion": [-0.5, 0.1, 0.1, 0.73**0.5], "velocity": [-1.0, 0.0, -0.6]},
 ]
-RATE, NAMES = [0.4, -0.6, 0.3], ("position", "velocity", "quaternion", "angular_velocity")
+RATE, NAMES = {"angular_velocity": [0.4, -0.6, 0.3]}, ("position", "velocity", "quaternion", "angular_velocity")
 FRAMES = {"crazyflie": frames.crazyflie(), "px4": frames.px4(), "betaflight": frames.betaflight()}
+FLAGS = "-O1 -Wall -Wextra -Werror -include stdint.h -include stdio.h -include stdlib.h -include string.h "
+FLAGS += "-DPARAM_GROUP_START(x)= -DPARAM_ADD(a,b,c)= -DPARAM_GROUP_STOP(x)= -DM2T(x)=x"
+MAIN = """
+int main(int n, char **given) { for (int i = 1; i < n; ++i) x[i - 1] = (float)atof(given[i]);
+  fly(); for (int i = 0; i < count; ++i) printf("%g ", said[i]); }
+"""
 OBSERVE = """
 void pilot_observe(const float a[3], const float b[4], const float c[3], const float d[3], float y[POLICY_OBSERVATION])
-{ (void)a, (void)b, (void)c, (void)d; for (int i = 0; i < POLICY_OBSERVATION; ++i) y[i] = x[13 + i]; }
+{ (void)a, (void)b, (void)c, (void)d; memcpy(y, x + 13, POLICY_OBSERVATION * sizeof *y); }
 """
-MAIN = "\nint main(int n, char **given) { for (int i = 1; i < n; ++i) x[i - 1] = (float)atof(given[i]); fly(); }\n"
-STUBS = {
-    "crazyflie": {
-        "app.h": "#pragma once\n#include <stdint.h>\n#include <stdio.h>\n#include <stdlib.h>\n#include <string.h>\n"
-        "#define PARAM_GROUP_START(x)\n#define PARAM_ADD(a, b, c)\n#define PARAM_GROUP_STOP(x)\n#define M2T(x) (x)\n"
-        "typedef uint32_t TickType_t; typedef int logVarId_t;\n"
-        "enum { modeAbs = 1, modeVelocity, COMMANDER_PRIORITY_EXTRX };\n"
-        "typedef struct { struct { float roll, pitch, yaw; } attitude, attitudeRate; float thrust;\n"
-        "  struct { float x, y, z; } velocity; struct { int x, y, z, roll, pitch, yaw; } mode; } setpoint_t;\n"
-        "TickType_t xTaskGetTickCount(void); void vTaskDelay(TickType_t);\n"
-        "void vTaskDelayUntil(TickType_t *, TickType_t);\n"
-        "logVarId_t logGetVarId(const char *, const char *); float logGetFloat(logVarId_t);\n"
-        "void commanderSetSetpoint(const setpoint_t *, int);\n",
-        **{name: '#include "app.h"\n' for name in ("FreeRTOS.h", "commander.h", "log.h", "param.h", "task.h")},
-        "main.c": 'static float x[99];\n#include "policy_crazyflie.c"\n'
-        'static const char *all = "x y z vx vy vz qw qx qy qz "; static int calls;\n'
-        "TickType_t xTaskGetTickCount(void) { return 0; }\nvoid vTaskDelay(TickType_t x) { (void)x; exit(1); }\n"
-        "void vTaskDelayUntil(TickType_t *t, TickType_t x) { if (x != 20) exit(2); (void)t; flies = calls++ > 0; }\n"
-        "logVarId_t logGetVarId(const char *group, const char *name) { char key[9]; int i = 0; const char *at = all;\n"
-        "  if (group[0] == 'g') return 10 + name[0] - 'x';\n  snprintf(key, sizeof key, \"%s \", name);\n"
-        "  while (strncmp(at, key, strlen(key))) { at = strchr(at, ' ') + 1; ++i; }\n  return i; }\n"
-        "float logGetFloat(logVarId_t i) { return x[i]; }\n"
-        "void commanderSetSetpoint(const setpoint_t *s, int p) {\n"
-        '  printf("%g %g %g %g %g %g %g %g %g %g %d%d%d%d%d%d",'
-        "  s->attitude.roll, s->attitude.pitch, s->attitude.yaw, s->attitudeRate.roll, s->attitudeRate.pitch,\n"
-        "  s->attitudeRate.yaw, s->velocity.x, s->velocity.y, s->velocity.z, s->thrust, s->mode.x, s->mode.y,\n"
-        "  s->mode.z, s->mode.roll, s->mode.pitch, s->mode.yaw); exit(p != 3); }\n"
-        "static void fly(void) { appMain(); }\n",
-    },
-    "px4": {
-        "messages.h": "#pragma once\n#include <cstdio>\n#include <cstdlib>\n"
-        "struct vehicle_attitude_s { unsigned long timestamp; float q[4]; };\n"
-        "struct vehicle_local_position_s { float x, y, z, vx, vy, vz; };\n"
-        "struct vehicle_angular_velocity_s { float xyz[3]; };\n"
-        "struct vehicle_rates_setpoint_s { unsigned long timestamp; float roll, pitch, yaw, thrust_body[3]; };\n"
-        "struct vehicle_attitude_setpoint_s { unsigned long timestamp; float q_d[4], yaw_sp_move_rate;\n"
-        "  float thrust_body[3]; };\n"
-        "struct trajectory_setpoint_s { float position[3], velocity[3], acceleration[3], jerk[3], yaw, yawspeed;\n"
-        "  unsigned long timestamp; };\n",
-        **{
-            f"uORB/topics/{name}.h": '#include "messages.h"\n'
-            for name in ("vehicle_rates_setpoint", "vehicle_attitude_setpoint", "trajectory_setpoint")
-            + ("vehicle_attitude", "vehicle_local_position", "vehicle_angular_velocity")
-        },
-        "main.cpp": 'static float x[99];\n#include "policy_px4.cpp"\n'
-        "inline void show(const vehicle_rates_setpoint_s &s) {\n"
-        '  printf("%g %g %g %g", s.roll, s.pitch, s.yaw, s.thrust_body[2]); }\n'
-        'inline void show(const vehicle_attitude_setpoint_s &s) { for (float q : s.q_d) printf("%g ", q);\n'
-        '  printf("%g %g", s.yaw_sp_move_rate, s.thrust_body[2]); }\n'
-        "inline void show(const trajectory_setpoint_s &s) {\n"
-        "  const float *all[] = {s.position, s.velocity, s.acceleration};\n"
-        '  for (auto *v : all) printf("%g %g %g ", v[0], v[1], v[2]);\n'
-        '  printf("%g %g", s.yaw, s.yawspeed); }\n'
-        "template <class S> static void send(bool call(pilot_t &, const vehicle_local_position_s &,\n"
-        "  const vehicle_attitude_s &, const vehicle_angular_velocity_s &, float, S &)) {\n"
-        "  pilot_t pilot; S s; policy_px4_start(pilot);\n"
-        "  if (!call(pilot, {x[0], x[1], x[2], x[3], x[4], x[5]}, {0, {x[6], x[7], x[8], x[9]}},\n"
-        "    {{x[10], x[11], x[12]}}, 0.5f, s)) exit(1);\n  show(s); }\nstatic void fly() { send(policy_px4); }\n",
-    },
-    "betaflight": {
-        "rx/rx.h": "#include <stdint.h>\ntypedef struct { int x; } rxRuntimeState_t;",
-        "main.c": '#include <stdio.h>\n#include <stdlib.h>\nstatic float x[99];\n#include "policy_betaflight.c"\n'
-        "static void fly(void) { policyStart(); policyUpdate(x, x + 6, x + 3, x + 10);\n"
-        '  for (int i = 0; i < 4; ++i) printf("%g ", policyReadRawRC(0, (uint8_t)i)); }\n',
-    },
+HEADERS = {
+    "crazyflie": "app.h FreeRTOS.h commander.h log.h param.h task.h",
+    "px4": "vehicle_attitude.h vehicle_local_position.h vehicle_angular_velocity.h vehicle_rates_setpoint.h "
+    "vehicle_attitude_setpoint.h trajectory_setpoint.h",
+    "betaflight": "rx.h",
+}
+STUBS = {  # what stands in the headers, then what calls the code
+    "crazyflie": """#include <setjmp.h>
+typedef uint32_t TickType_t; typedef int logVarId_t; enum { modeAbs = 1, modeVelocity, COMMANDER_PRIORITY_EXTRX };
+typedef struct { struct { float roll, pitch, yaw; } attitude, attitudeRate; struct { float x, y, z; } velocity;
+  float thrust; struct { float x, y, z, roll, pitch, yaw; } mode; } setpoint_t;
+static jmp_buf end; static const char *all = "x y z vx vy vz qw qx qy qz "; static int calls; static uint8_t flies;
+static TickType_t xTaskGetTickCount(void) { return 0; }
+static void vTaskDelay(TickType_t x) { (void)x; exit(1); }
+static void vTaskDelayUntil(TickType_t *t, TickType_t x) { if (x != 20) exit(2); (void)t; flies = calls++ > 0; }
+static logVarId_t logGetVarId(const char *group, const char *name) {
+  char key[9]; snprintf(key, sizeof key, "%s ", name); int i = 0;
+  for (const char *at = all; strncmp(at, key, strlen(key)); at = strchr(at, ' ') + 1) ++i;
+  return group[0] == 'g' ? 10 + i : i; }
+static float logGetFloat(logVarId_t i) { return x[i]; }
+static void commanderSetSetpoint(const setpoint_t *s, int p) { memcpy(said, s, sizeof *s); longjmp(end, p); }
+@
+static void fly(void) { count = 16; if (!setjmp(end)) appMain(); }""",
+    "px4": """
+struct vehicle_attitude_s { unsigned long timestamp; float q[4]; };
+struct vehicle_local_position_s { float x, y, z, vx, vy, vz; };
+struct vehicle_angular_velocity_s { float xyz[3]; };
+struct vehicle_rates_setpoint_s { float roll, pitch, yaw, thrust_body[3]; int timestamp; };
+struct vehicle_attitude_setpoint_s { float q_d[4], yaw_sp_move_rate, thrust_body[3]; int timestamp; };
+struct trajectory_setpoint_s { float position[3], velocity[3], acceleration[3], jerk[3], yaw, yawspeed; int timestamp;};
+@
+template <class S> static void send(bool call(pilot_t &, const vehicle_local_position_s &, const vehicle_attitude_s &,
+                                              const vehicle_angular_velocity_s &, float, S &)) {
+  pilot_t pilot; S s; policy_px4_start(pilot); count = sizeof s / sizeof(float) - 1;
+  const vehicle_local_position_s at = {x[0], x[1], x[2], x[3], x[4], x[5]};
+  if (!call(pilot, at, {0, {x[6], x[7], x[8], x[9]}}, {{x[10], x[11], x[12]}}, 0.5f, s)) exit(1);
+  memcpy(said, &s, count * sizeof(float)); }
+static void fly() { send(policy_px4); }""",
+    "betaflight": """
+typedef struct { int x; } rxRuntimeState_t;
+@
+static void fly(void) { policyStart(); policyUpdate(x, x + 6, x + 3, x + 10);
+  for (count = 0; count < 4; ++count) said[count] = policyReadRawRC(0, (uint8_t)count); }""",
 }
 
 
-def assert_commands_what_the_bundle_does(target, folder, bundle, stubs):
-    """In flights that begin in STATES, compiled with all warnings."""
-    main = "main.cpp" if target == "px4" else "main.c"
+def assert_commands_what_the_bundle_does(target, folder, bundle):
+    """In the first step of a flight from each of STATES, compiled with all warnings."""
+    name, stubs = next(x.name for x in folder.glob("policy_*.c*")), folder.with_suffix(".stubs")
+    before, after = STUBS[target].split("@")
     observe = OBSERVE if "Write this function" in (folder / "pilot.h").read_text() else ""
-    for name, text in STUBS[target].items():
-        (stubs / name).parent.mkdir(parents=True, exist_ok=True)
-        (stubs / name).write_text(text + (observe + MAIN) * (name == main))
-    strict = ["-O1", "-Wall", "-Wextra", "-Werror", f"-I{stubs}", f"-I{folder}"]
-    subprocess.run(["gcc", "-c", *strict, folder / "policy.c", "-o", stubs / "policy.o"], check=True)
-    program = ["g++" if target == "px4" else "gcc", *strict, stubs / main, stubs / "policy.o", "-lm"]
-    subprocess.run([*program, "-o", stubs / "fly"], check=True)
+    code = (
+        "static float x[99], said[20]; static int count;",
+        before,
+        (folder / name).read_text(),
+        observe,
+        after,
+        MAIN,
+    )
+    for header in HEADERS[target].split():
+        place = stubs / {"px4": "uORB/topics", "betaflight": "rx"}.get(target, "") / header
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.touch()
+    (stubs / name).write_text("\n".join(code))
+    command = [{"px4": "g++"}.get(target, "gcc"), *FLAGS.split(), f"-I{stubs}", f"-I{folder}"]
+    subprocess.run(["gcc", "-c", *command[1:], folder / "policy.c", "-o", stubs / "policy.o"], check=True)
+    subprocess.run([*command, stubs / name, stubs / "policy.o", "-lm", "-o", stubs / "fly"], check=True)
     for state in STATES:
         bundle.reset()
-        command = np.concatenate([np.atleast_1d(x) for x in bundle(resting(**state, angular_velocity=RATE))])
-        frame = FRAMES[target]
-        theirs = frame.to({**state, "angular_velocity": RATE})
+        command = np.concatenate([np.atleast_1d(x) for x in bundle(resting(**state, **RATE))])
+        theirs = FRAMES[target].to(state | RATE)
         if target == "crazyflie":
             theirs["quaternion"] = np.roll(theirs["quaternion"], 1)  # its log has qw first
             theirs["angular_velocity"] = np.degrees(theirs["angular_velocity"])
         given = np.concatenate([*(theirs[name] for name in NAMES), bundle.observation]).astype(str)
         found = subprocess.run([stubs / "fly", *given], check=True, capture_output=True).stdout.split()
-        found, expected = np.array(found, float), wanted(target, bundle, command, state)
-        np.testing.assert_allclose(found, expected, rtol=2e-5, atol=2e-5 * np.nanmax(np.abs(expected)))
+        expected = np.concatenate(wanted(target, bundle.contract, command, state), None)
+        np.testing.assert_allclose(np.array(found, float), expected, rtol=2e-5, atol=2e-5 * np.nanmax(abs(expected)))
 
 
-def wanted(target, bundle, command, state):
-    """What the stubs print for a command of the bundle."""
-    control, drone = bundle.contract["output"]["control"], Drone(bundle.contract["drone"])
-    frame, full = FRAMES[target], 4 * drone.thrust_limits[1]
-    rates = frame.to({"body_rate": command[1:]})["body_rate"]
+def wanted(target, contract, command, state):
+    """What a firmware is told to follow a command of the bundle: all numbers of its setpoint."""
+    control, drone, frame = contract["output"]["control"], Drone(contract["drone"]), FRAMES[target]
+    rates, none, unset = frame.to({"body_rate": command[1:]})["body_rate"], np.zeros(3), np.full(3, np.nan)
     if target == "betaflight":
-        idle = autopilots.idle(drone)
+        idle, stick = autopilots.idle(drone), 1500 + 500 * rates / autopilots.stick_rate(contract)
         throttle = frames.betaflight(min_check=autopilots.MIN_CHECK, motor_idle=idle)
-        roll, pitch, yaw = 1500 + 500 * rates / autopilots.stick_rate(bundle.contract)
-        return [roll, pitch, throttle.thrust(command[0], *autopilots.throttle(drone, idle)[:2]), yaw]
-    none, angles = [0.0, 0.0, 0.0], np.degrees(command[1:]) * (1, -1, 1)  # cflib turns the signs of pitch and yaw
+        return stick[:2], throttle.thrust(command[0], *autopilots.throttle(drone, idle)[:2]), stick[2]
     if target == "crazyflie":
-        thrust = 0.0 if control == "velocity" else frame.thrust(command[0], full)
-        turn = [0.0, 0.0, angles[2]]
+        thrust, turn = frame.thrust(command[0], 4 * drone.thrust_limits[1]), np.degrees(command[1:]) * (1, -1, 1)
         return {
-            "rates": [*none, *angles, *none, thrust, 222],
-            "attitude": [*angles[:2], 0.0, *turn, *none, thrust, 112],
-            "velocity": [*none, *turn, *command[:3], thrust, 222002],
+            "rates": (none, turn, none, thrust, none, [2, 2, 2]),
+            "attitude": (turn[:2], none, turn[2], none, thrust, none, [1, 1, 2]),
+            "velocity": (none, 0, 0, turn[2], command[:3], 0, [2, 2, 2, 0, 0, 2]),
         }[control]
-    thrust = frame.thrust(command[0], drone.weight / 0.5)
-    if control == "velocity":
-        return [*3 * [np.nan], *frame.to({"velocity": command[:3]})["velocity"], *4 * [np.nan], -command[3]]
-    if control == "rates":
-        return [*rates, thrust]
+    thrust = 0, 0, frame.thrust(command[0], drone.weight / 0.5)
     heading = Rotation.from_quat(state["quaternion"], scalar_first=True).as_euler("ZYX")[0]
     turned = Rotation.from_euler("ZYX", [heading, command[2], command[1]]).as_quat(scalar_first=True)
-    theirs = frame.to({"quaternion": turned})["quaternion"]
-    return [*theirs * np.sign(theirs[0]), -command[3], thrust]
+    turned, velocity = frame.to({"quaternion": turned})["quaternion"], frame.to({"velocity": command[:3]})["velocity"]
+    return {
+        "rates": (rates, thrust),
+        "attitude": (turned * np.sign(turned[0]), -command[3], thrust),
+        "velocity": (unset, velocity, unset, none, np.nan, -command[3]),
+    }[control]
 
 
 def test_the_recipe_writes_code_for_a_firmware_that_commands_what_the_bundle_does(train, launch, trace_once, tmp_path):
@@ -151,7 +140,7 @@ def test_the_recipe_writes_code_for_a_firmware_that_commands_what_the_bundle_doe
     printed = launch("export", f"checkpoint={tmp_path}/checkpoint.pt", "target=betaflight", "episodes=8")
     assert printed.startswith(f"{tmp_path}/policy_betaflight: for the firmware of betaflight\n")
     bundle = load_bundle(tmp_path / "policy")
-    assert_commands_what_the_bundle_does("betaflight", tmp_path / "policy_betaflight", bundle, tmp_path / "stubs")
+    assert_commands_what_the_bundle_does("betaflight", tmp_path / "policy_betaflight", bundle)
 
 
 @pytest.mark.parametrize("target", ["crazyflie", "px4"])
@@ -159,7 +148,7 @@ def test_the_recipe_writes_code_for_a_firmware_that_commands_what_the_bundle_doe
 def test_code_for_a_firmware_commands_in_each_mode_what_the_bundle_does(task, target, export_once, tmp_path):
     (tmp_path / "policy").symlink_to(export_once(task)[2])
     folder = write_target(tmp_path / "policy", target)
-    assert_commands_what_the_bundle_does(target, folder, load_bundle(tmp_path / "policy"), tmp_path / "stubs")
+    assert_commands_what_the_bundle_does(target, folder, load_bundle(tmp_path / "policy"))
 
 
 @cases(

@@ -155,19 +155,14 @@ def test_code_for_a_firmware_commands_in_each_mode_what_the_bundle_does(task, ta
     (
         "landing",
         "betaflight",
-        "this firmware takes rates, and the policy commands attitude. Train it with env.control=r",
+        "commands rates from what a drone measures; this policy commands attitude. Train it with env.c",
     ),
     (
         "hovering, with memory",
         "px4",
-        "takes rates or attitude or velocity, and the policy commands rotor_thrusts. Train",
+        "rates or attitude or velocity .* commands rotor_thrusts. Train it with env.control=rates,",
     ),
-    (
-        "forest",
-        "crazyflie",
-        "policies that read what a drone measures, and this one reads an image. Call policy.c from",
-    ),
-    ("tracking", "px4", "and this one reads commands on their way"),
+    ("tracking", "crazyflie", "Train it with env.observe_last_action=false, or call policy.c from code of your own"),
     ("hovering", "ardupilot", "target must be one of crazyflie, px4, betaflight, got 'ardupilot'"),
 )
 def test_a_policy_that_a_firmware_cannot_follow_is_refused_with_what_to_train(task, target, said, export_once):

@@ -24,12 +24,13 @@ TARGETS: dict[str, dict[str, str | None]] = {
     "px4": {"policy_px4.cpp": None},
     "betaflight": {"policy_betaflight.c": None},
 }
-MESSAGES = {  # of PX4, by what the policy commands
+# What each takes of what policies command; for PX4 with the message.
+MESSAGES = {
     "rates": "vehicle_rates_setpoint",
     "attitude": "vehicle_attitude_setpoint",
     "velocity": "trajectory_setpoint",
 }
-MODES = {"crazyflie": tuple(MESSAGES), "px4": tuple(MESSAGES), "betaflight": ("rates",)}  # that a firmware follows
+MODES = {"crazyflie": tuple(MESSAGES), "px4": tuple(MESSAGES), "betaflight": ("rates",)}
 AIMED = ("hovering", "landing")  # tasks that observe a target and the body
 STACK = 2000  # of an app, in words, which holds the layers of networks up to 500 wide
 
@@ -50,16 +51,12 @@ def write_target(folder: str | Path, target: str) -> Path:
     if not isinstance(target, str) or target not in TARGETS:
         raise UserValueError(f"target must be one of {', '.join(TARGETS)}, got {shown(target)}.")
     control, modes = output["control"], MODES[target]
-    if control not in modes:
+    wrong = {"env.control=rates": control not in modes, "env.camera=null": contract["camera"]}
+    wrong["env.observe_last_action=false"] = "action_queue" in contract["graphs"]["observe"]["reads"]
+    if wrong := [setting for setting, has in wrong.items() if has]:
         raise UserValueError(
-            f"target={target}: this firmware takes {' or '.join(modes)}, and the policy commands {control}. Train it "
-            f"with env.control={modes[0]}, or call policy.c from code of your own."
-        )
-    queue = "action_queue" in contract["graphs"]["observe"]["reads"]
-    if wrong := "an image" if contract["camera"] else "commands on their way" if queue else "":
-        raise UserValueError(
-            f"target={target}: the code is for policies that read what a drone measures, and this one reads {wrong}. "
-            "Call policy.c from code of your own."
+            f"target={target}: the code commands {' or '.join(modes)} from what a drone measures; this policy commands "
+            f"{control}. Train it with {' '.join(wrong)}, or call policy.c from code of your own."
         )
     drone = Drone(contract["drone"])
     idle = autopilots.idle(drone)

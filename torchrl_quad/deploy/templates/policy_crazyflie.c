@@ -56,11 +56,9 @@ void appMain(void)
         setpoint.mode.yaw = modeVelocity;
         setpoint.attitudeRate.yaw = DEGREES * command[3];
 @rates         setpoint.mode.roll = setpoint.mode.pitch = modeVelocity;
-@rates         setpoint.attitudeRate.roll = DEGREES * command[1];
-@rates         setpoint.attitudeRate.pitch = -DEGREES * command[2];
+@rates         setpoint.attitudeRate.roll = DEGREES * command[1], setpoint.attitudeRate.pitch = -DEGREES * command[2];
 @attitude         setpoint.mode.roll = setpoint.mode.pitch = modeAbs;
-@attitude         setpoint.attitude.roll = DEGREES * command[1];
-@attitude         setpoint.attitude.pitch = -DEGREES * command[2];
+@attitude         setpoint.attitude.roll = DEGREES * command[1], setpoint.attitude.pitch = -DEGREES * command[2];
 @velocity         setpoint.mode.x = setpoint.mode.y = setpoint.mode.z = modeVelocity; /* in the world frame */
 @velocity         setpoint.velocity.x = command[0], setpoint.velocity.y = command[1], setpoint.velocity.z = command[2];
 @thrust         setpoint.thrust = fminf(command[0] / FULL_THRUST * 65535.0f, 60000.0f);

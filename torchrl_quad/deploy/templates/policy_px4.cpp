@@ -24,26 +24,18 @@ bool policy_px4(pilot_t &pilot, const vehicle_local_position_s &local, const veh
     const bool broken = pilot_step(&pilot, position, quaternion, velocity, rate, command) != 0;
     setpoint = {};
     setpoint.timestamp = attitude.timestamp;
-@rates     setpoint.roll = command[1];
-@rates     setpoint.pitch = -command[2];
-@rates     setpoint.yaw = -command[3];
+@rates     setpoint.roll = command[1], setpoint.pitch = -command[2], setpoint.yaw = -command[3];
 @attitude     /* Turned by roll, then by pitch, then to the heading that the drone has. */
 @attitude     const float heading = std::atan2(2.0f * (q[0] * q[3] + q[1] * q[2]), 1.0f - 2.0f * (q[2] * q[2] + q[3] * q[3]));
 @attitude     const float sr = std::sin(0.5f * command[1]), sp = std::sin(-0.5f * command[2]), sy = std::sin(0.5f * heading);
 @attitude     const float cr = std::cos(0.5f * command[1]), cp = std::cos(0.5f * command[2]), cy = std::cos(0.5f * heading);
-@attitude     setpoint.q_d[0] = cy * cp * cr + sy * sp * sr;
-@attitude     setpoint.q_d[1] = cy * cp * sr - sy * sp * cr;
-@attitude     setpoint.q_d[2] = cy * sp * cr + sy * cp * sr;
-@attitude     setpoint.q_d[3] = sy * cp * cr - cy * sp * sr;
+@attitude     setpoint.q_d[0] = cy * cp * cr + sy * sp * sr, setpoint.q_d[1] = cy * cp * sr - sy * sp * cr;
+@attitude     setpoint.q_d[2] = cy * sp * cr + sy * cp * sr, setpoint.q_d[3] = sy * cp * cr - cy * sp * sr;
 @attitude     setpoint.yaw_sp_move_rate = -command[3];
-@velocity     const float velocity_ned[3] = {command[1], command[0], -command[2]};
-@velocity     for (int i = 0; i < 3; ++i) {
-@velocity         setpoint.position[i] = setpoint.acceleration[i] = NAN; /* not commanded */
-@velocity         setpoint.velocity[i] = velocity_ned[i];
-@velocity     }
-@velocity     setpoint.yaw = NAN;
+@velocity     const float ned[3] = {command[1], command[0], -command[2]}; /* NAN: not commanded */
+@velocity     for (int i = 0; i < 3; ++i) setpoint.velocity[i] = ned[i], setpoint.position[i] = setpoint.acceleration[i] = NAN;
+@velocity     setpoint.yaw = NAN, (void)hover_thrust;
 @velocity     setpoint.yawspeed = -command[3];
-@velocity     (void)hover_thrust;
 @thrust     setpoint.thrust_body[2] = std::fmax(-command[0] / ($weight / hover_thrust), -1.0f); /* MPC_THR_HOVER */
     return !broken;
 }

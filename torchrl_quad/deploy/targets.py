@@ -24,13 +24,8 @@ TARGETS: dict[str, dict[str, str | None]] = {
     "px4": {"policy_px4.cpp": None},
     "betaflight": {"policy_betaflight.c": None},
 }
-# What each takes of what policies command; for PX4 with the message.
-MESSAGES = {
-    "rates": "vehicle_rates_setpoint",
-    "attitude": "vehicle_attitude_setpoint",
-    "velocity": "trajectory_setpoint",
-}
-MODES = {"crazyflie": tuple(MESSAGES), "px4": tuple(MESSAGES), "betaflight": ("rates",)}
+# What each takes of what policies command.
+MODES = dict.fromkeys(("crazyflie", "px4"), ("rates", "attitude", "velocity")) | {"betaflight": ("rates",)}
 AIMED = ("hovering", "landing")  # tasks that observe a target and the body
 STACK = 2000  # of an app, in words, which holds the layers of networks up to 500 wide
 
@@ -64,8 +59,8 @@ def write_target(folder: str | Path, target: str) -> Path:
     aims = contract["task"]["name"] in AIMED and contract["observation"]["size"] == 13
     values = {
         "task": contract["task"]["name"],
-        "control": {"rates": "body rates"}.get(control, control),
-        "message": MESSAGES[control],
+        "control": control,
+        "message": {"velocity": "trajectory"}.get(control, f"vehicle_{control}") + "_setpoint",
         "target": as_floats(bundle.starts()["target"][0]) if aims else "",
         "memory": " pilot->memory," if contract["memory"] else "",
         "full_thrust": as_float(len(drone.rotor_spin) * drone.thrust_limits[1]),

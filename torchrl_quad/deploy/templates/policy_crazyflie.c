@@ -1,4 +1,4 @@
-/* An app of the Crazyflie: the policy of the task "$task" sends $control. Generated. Untried on a drone.
+/* An app of the Crazyflie: the policy of the task "$task" commands $control. Generated. Untried on a drone.
  *
  * Make it with `make CRAZYFLIE_BASE=path/to/crazyflie-firmware` in this folder. Frames as in torchrl_quad.deploy.frames:
  * both have z up and x forward; pitch counts with the other sign; angles are in degrees. The firmware turns a wanted yaw

@@ -1,4 +1,4 @@
-/* For a PX4 module: the policy of the task "$task" as a setpoint of $control. Generated. Untried on a drone.
+/* For a PX4 module: the policy of the task "$task" as a setpoint ($control). Generated. Untried on a drone.
  *
  * Call it every POLICY_CONTROL_DT from the Run() of a module in offboard mode, with the newest messages, and publish what
  * it writes as $message. Ours are x east, y north, z up, and a body with y left; PX4's are NED and FRD.

@@ -122,6 +122,13 @@ def test_where_it_cannot_fly_it_says_in_one_line_what_to_install(what, said, mod
     assert "\n" not in refuses(said, make_simulator, "betaflight", contract(), "own", error=UserError)
 
 
+@pytest.mark.usefixtures("module")
+def test_a_policy_that_commands_rotors_is_refused_where_a_loop_of_body_rates_is_the_only_way():
+    about = contract()
+    about["output"]["control"] = "rotor_thrusts"
+    refuses("betaflight, loop=own, mixes body rates; .* Fly it in mujoco", make_simulator, "betaflight", about, "own")
+
+
 STAND_IN = """
 #include <arpa/inet.h>
 #include <pthread.h>

@@ -78,8 +78,8 @@ def simulator_class(name: str) -> type[Simulator]:
 def make_simulator(
     name: str, contract: Contract, loop: str = "contract", motors: Sequence[int] = (0, 1, 2, 3)
 ) -> Simulator:
-    """Build a simulator by its name; ValueError where it is unknown, or lacks the rate loop, or the camera or way to the
-    rotors that the policy needs, or where the bundle cannot judge, ImportError where it is not installed."""
+    """Build a simulator by its name; ValueError where it is unknown, or lacks the rate loop, or the camera or way to
+    the rotors that the policy needs, or where the bundle cannot judge, ImportError where it is not installed."""
     if why := contract["task"]["unjudged"]:
         raise UserValueError(
             f"The simulators here cannot fly this bundle of the task {contract['task']['name']!r}: {why}. Fly it in "

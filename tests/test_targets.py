@@ -1,5 +1,6 @@
 """Code for a firmware compiles against its headers, as far as it uses them, and commands what the bundle does."""
 
+import re
 import subprocess
 
 import numpy as np
@@ -28,13 +29,7 @@ OBSERVE = """
 void pilot_observe(const float a[3], const float b[4], const float c[3], const float d[3], float y[POLICY_OBSERVATION])
 { (void)a, (void)b, (void)c, (void)d; memcpy(y, x + 13, POLICY_OBSERVATION * sizeof *y); }
 """
-HEADERS = {
-    "crazyflie": "app.h FreeRTOS.h commander.h log.h param.h task.h",
-    "px4": "vehicle_attitude.h vehicle_local_position.h vehicle_angular_velocity.h vehicle_rates_setpoint.h "
-    "vehicle_attitude_setpoint.h trajectory_setpoint.h",
-    "betaflight": "rx.h",
-}
-STUBS = {  # what stands in the headers, then what calls the code
+STUBS = {  # what its headers declare, then what calls the code
     "crazyflie": """#include <setjmp.h>
 typedef uint32_t TickType_t; typedef int logVarId_t; enum { modeAbs = 1, modeVelocity, COMMANDER_PRIORITY_EXTRX };
 typedef struct { struct { float roll, pitch, yaw; } attitude, attitudeRate; struct { float x, y, z; } velocity;
@@ -87,10 +82,9 @@ def assert_commands_what_the_bundle_does(target, folder, bundle):
         after,
         MAIN,
     )
-    for header in HEADERS[target].split():
-        place = stubs / {"px4": "uORB/topics", "betaflight": "rx"}.get(target, "") / header
-        place.parent.mkdir(parents=True, exist_ok=True)
-        place.touch()
+    for header in set(re.findall(r'#include ["<](.+[.]h)', code[2])) - {"math.h", "pilot.h"}:
+        (stubs / header).parent.mkdir(parents=True, exist_ok=True)
+        (stubs / header).touch()
     (stubs / name).write_text("\n".join(code))
     command = [{"px4": "g++"}.get(target, "gcc"), *FLAGS.split(), f"-I{stubs}", f"-I{folder}"]
     subprocess.run(["gcc", "-c", *command[1:], folder / "policy.c", "-o", stubs / "policy.o"], check=True)

@@ -179,7 +179,7 @@ class DoubtfulEnv(HoveringEnv):
         {"near": 10.0, "width": 0.08},
         "'near' is flat in .* of the flights, those in which it pays least",
     ),
-    (HoveringEnv, {}, {}, "'attitude' is less than a thousandth of the return and of its gradient"),
+    (HoveringEnv, {}, {}, "'attitude' is less than a thousandth of return and gradient"),
 )
 def test_the_audit_says_in_words_what_keeps_a_policy_from_learning_a_task(task, options, weights, trap, monkeypatch):
     for name in options.keys() & {"success_radius"}:

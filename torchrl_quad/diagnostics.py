@@ -83,10 +83,7 @@ class RewardAudit(dict[str, TermAudit]):
         share = sum(self[name].return_share for name in lost)
         partially = f"partially differentiable: all but {', '.join(lost)}, {share:.1%} of the return"
         lines += [partially if lost else "fully differentiable", *(f"trap: {trap}" for trap in self.traps)]
-        if self.unseen:
-            lines.append(
-                f"not seen: {', '.join(self.unseen)}. Traps there stay hidden: start some drones close to them."
-            )
+        lines += [f"not seen, start some drones close to it: {end}" for end in self.unseen]
         return "\n".join(lines)
 
 
@@ -105,15 +102,10 @@ def audit_reward(
     """Find out which terms of a reward have a gradient, how much each adds to the return, and what traps there are.
 
     A verdict holds for this rollout alone, of any differentiable environment. Start it where all terms are paid, and
-    make it longer than the delay between an action and its effect. ``traps`` names, in words:
-
-    - a target that jumps on arrival and lowers the reward by more than the arrival pays: waiting before it pays;
-    - steps that pay less than nothing, while a crash costs less than going on: dying is cheap;
-    - a success that ends the episode and pays less than going on: loitering pays;
-    - a term that is flat far from the goal, for most of the starts;
-    - terms a thousand times smaller than the others.
-
-    Going on counts as 1 / (1 - gamma) steps, or the length of the rollout for a gamma of 1.
+    make it longer than the delay between an action and its effect. Its ``traps`` mislead a policy: waiting pays
+    more than an arrival after which the target jumps; dying is cheap where steps pay less than nothing; loitering pays
+    more than a success that ends the episode; a term is flat in most flights, or too small to matter. To go on counts
+    as 1 / (1 - gamma) steps, for a gamma of 1 as the horizon.
 
     Args:
         rollout: (*, horizon) with its graph, as ``differentiable_rollout`` returns it.
@@ -183,21 +175,14 @@ def audit_reward(
     said = [name for name in ("success", "crash", "terminated") if (*beside, name) in rollout]
     ends = {name: leaf(rollout, (*beside, name)) for name in said}
     audit.unseen = [name for name in said if name != "terminated" and not ends[name].any()]
-    differentiable = [name for name, x in audit.items() if x.verdict == "differentiable"]
-    audit.traps = [
-        *_jumping(reward.detach(), done, rollout.get((*beside, "state"), None)),
-        *_ending(reward.detach(), ends, shape[-2] if gamma == 1.0 else 1.0 / (1.0 - gamma)),
-        *(
-            trap
-            for name in differentiable
-            for trap in _flat(name, terms[name], returns[name], grads[name][len(sources) :])
-        ),
-        *(
-            f"{name!r} is less than a thousandth of the return and of its gradient: it teaches nothing."
-            for name in differentiable
-            if max(audit[name].return_share, audit[name].gradient_share) < 1e-3
-        ),
-    ]
+    traps = [*_jumping(reward.detach(), done, rollout.get((*beside, "state"), None))]
+    traps += _ending(reward.detach(), ends, shape[-2] if gamma == 1.0 else 1.0 / (1.0 - gamma))
+    for name, x in audit.items():
+        if x.verdict == "differentiable":
+            traps += _flat(name, terms[name], returns[name], grads[name][len(sources) :])
+            if max(x.return_share, x.gradient_share) < 1e-3:
+                traps.append(f"{name!r} is less than a thousandth of return and gradient: it teaches nothing")
+    audit.traps = traps
     return audit
 
 
@@ -223,8 +208,7 @@ def _jumping(reward: Tensor, done: Tensor, state: Any) -> Iterator[str]:
         before, after = (sum(x) / len(falls) for x in zip(*falls, strict=True))
         yield (
             f"{', '.join(names)} jumped {len(jumps)} times, and a step then paid {after:.3g} instead of {before:.3g}: "
-            "waiting before an arrival pays more than arriving. Let an arrival pay what the next way costs, or reward "
-            "the velocity towards the target."
+            "waiting before an arrival pays more than arriving. Reward the velocity towards the target, or the arrival"
         )
 
 
@@ -238,14 +222,14 @@ def _ending(reward: Tensor, ends: Mapping[str, Tensor], steps: float) -> Iterato
     if ("crash" in ends or died.any()) and usual < 0.0 and cost > steps * usual:
         seen = f"costs {-cost:.3g}" if died.any() else "was not seen"
         yield (
-            f"a step pays {usual:.3g} on average, and {steps * usual:.3g} in {steps:.0f} steps, and a crash {seen}: "
-            "dying is cheap. Add a constant to each step, so that it pays more than nothing, or let a crash cost more."
+            f"a step pays {usual:.3g} on average, {steps * usual:.3g} in {steps:.0f} steps, and a crash {seen}: dying "
+            "is cheap. Add a constant, so that a good step pays more than nothing, or let a crash cost more"
         )
     before, ended = reward[..., :-1, :][won[..., 1:, :]], reward[..., 1:, :][won[..., 1:, :]]
     if len(before) and (loitering := steps * before.mean().item()) > ended.mean().item():
         yield (
             f"success ends an episode and pays {ended.mean().item():.3g}, while going on as in the step before it pays "
-            f"{loitering:.3g} in {steps:.0f} steps: loitering pays more. Let success pay more than that, or not end it."
+            f"{loitering:.3g} in {steps:.0f} steps: loitering pays more. Let success pay more, or the episode go on"
         )
 
 
@@ -260,7 +244,7 @@ def _flat(name: str, term: Tensor, returns: Tensor, grads: Sequence[Tensor | Non
     if paid and 2 * flat.sum() >= flat.numel() and returns[flat].mean() < returns[~flat].mean():
         yield (
             f"{name!r} is flat in {flat.float().mean():.0%} of the flights, those in which it pays least: it leads "
-            "nobody there. Reward a distance, or its logarithm, and nothing that saturates far from the goal."
+            "nobody there. Reward a distance, or its logarithm, and nothing that saturates far from the goal"
         )
 
 

@@ -17,10 +17,9 @@ def eight(phase):
 
 
 class Eight(TrackingEnv):
-    """Follows a point on it from rest; solved within 0.2 m, as a root mean square from 2 s on."""
+    """Follows a point on it from rest; solved within 0.1 m, as a root mean square from 2 s on."""
 
     defaults = {"curve": eight, "period": 2 * torch.pi * SIZE / SPEED, "drone": "small_racer"}
-    success_radius = 0.2
     metric_info = {**TrackingEnv.metric_info, "speed": Metric("speed at the end", "m/s")}
 
     def metrics(self, state):

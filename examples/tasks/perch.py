@@ -12,7 +12,7 @@ class Perch(QuadrotorEnv):
     """Solved by touching it slower than 1 m/s, within 10 degrees of the attitude; the target is a point in the wall."""
 
     defaults, ends_on_success = {"drone": "small_racer"}, True
-    weights = {"survival": 0.1, "lean": 0.05, "slip": 0.02, "spin": 0.001, "touch": 20.0}
+    weights = {"survival": 0.02, "lean": 0.02, "slip": 0.008, "spin": 0.001, "touch": 20.0}  # to wait pays less
 
     def initial_state(self, n):
         start = self.tensor([-1.5, 0.0, 1.5]) + 0.5 * self.uniform(n, 3)
@@ -27,7 +27,7 @@ class Perch(QuadrotorEnv):
     def reward_terms(self, state):
         way, lean = state["target"] - state["position"], self.lean(state)
         near, slip = (5.0 * state["position"][..., :1]).clamp_max(0.0).exp(), state["velocity"] - shortened(way, 1.5)
-        touch = self.weights["touch"] * (state["position"][..., :1] > 0) * (-3.0 * lean).exp()
+        touch = self.weights["touch"] * (state["position"][..., :1] > 0) * (-2.0 * lean - norm(state["velocity"])).exp()
         return {**penalties(self.weights, lean=near * lean, slip=slip, spin=state["angular_velocity"]), "touch": touch}
 
     def is_success(self, state):

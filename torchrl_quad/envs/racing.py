@@ -325,9 +325,8 @@ class RacingEnv(QuadrotorEnv):
         parts = [centre - state["position"] for centre, _ in poses]
         if self.observe_directions:
             ahead = [forward(rotation) for _, rotation in poses]
-            left = [
-                (gap * along).sum(-1, keepdim=True).clamp(-1.0, 1.0) for gap, along in zip(parts, ahead, strict=True)
-            ]
+            ways = zip(parts, ahead, strict=True)
+            left = [(gap * along).sum(-1, keepdim=True).clamp(-1.0, 1.0) for gap, along in ways]
             parts += [10.0 * x for x in (*ahead, *left)]
         return torch.cat((*parts, *terms.body_observation(state)), -1)
 

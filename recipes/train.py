@@ -9,6 +9,7 @@ from torchrl_quad import AHACLoss, differentiable_rollout, make_value, restart
 from torchrl_quad.training.building import (
     Optimizer,
     ReturnScale,
+    SteadyOptimizer,
     make_loss,
     mean_of_all,
     set_up,
@@ -23,7 +24,7 @@ from torchrl_quad.training.loop import Run
 def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
     loss = make_loss(AHACLoss, cfg, env, actor, make_value, horizon=cfg.horizon)
-    actor_optimizer, critic_optimizer = Optimizer(cfg, "actor", loss), Optimizer(cfg, "critic", loss)
+    actor_optimizer, critic_optimizer = SteadyOptimizer(cfg, "actor", loss), Optimizer(cfg, "critic", loss)
     bound, scale = trust_region(cfg, actor), ReturnScale(loss)
     run = Run(cfg, env, actor, loss, [actor_optimizer, critic_optimizer, scale])
     for _ in run:
@@ -34,6 +35,7 @@ def main(cfg: DictConfig) -> None:
         loss_actor, metrics = loss.loss_actor(rollout)
         with bound.around(rollout):
             run.optimise(actor_optimizer, loss_actor + metrics.get("loss_alpha", 0.0))
+        actor_optimizer.adapt(bound.metrics["kl"].item())
 
         # The critics: towards TD(lambda) targets, from the least of them.
         data = loss.write_value_target(rollout.detach())

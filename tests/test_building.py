@@ -80,16 +80,6 @@ def test_a_schedule_goes_from_the_first_to_the_last_learning_rate(schedule, half
         assert adam.param_groups[0]["lr"] == pytest.approx(rate)
 
 
-def test_a_root_schedule_holds_its_rate_and_then_falls_whatever_the_budget():
-    for iterations in (300, 100_000):
-        adam = optimizer(iterations, schedule="root")
-        rates = []
-        for iteration in (0, building.STEADY, 4 * building.STEADY):
-            adam.anneal(iteration)
-            rates.append(adam.param_groups[0]["lr"])
-        assert rates == pytest.approx([1e-2, 1e-2, 5e-3])
-
-
 @pytest.mark.parametrize("unit", [1.0, 1000.0])
 def test_rewards_in_any_unit_are_divided_by_the_size_of_returns_and_critics_keep_what_they_say(unit):
     torch.manual_seed(0)

@@ -26,7 +26,6 @@ from torchrl_quad.options import argument_names
 from torchrl_quad.training.configuration import own_disturbances, plain
 
 SEEDS_PER_PROCESS = 10_000
-STEADY = 50  # iterations before the rate of schedule=root falls, by the root of their number
 SMOOTHING = 0.05  # how much of the scale of returns is new in each iteration
 _Loss = TypeVar("_Loss", bound=PathwiseLoss)
 
@@ -176,7 +175,6 @@ class Optimizer(torch.optim.Adam):
             "linear": lambda share: 1.0 + share * (decay - 1.0),
             "exponential": lambda share: decay**share,
             "cosine": lambda share: decay + (1.0 - decay) * 0.5 * (1.0 + math.cos(math.pi * share)),
-            "root": lambda share: min(STEADY / max(share * (self.iterations - 1), 1.0), 1.0) ** 0.5,
         }
         self.factor = factors[section.schedule]
 
@@ -195,6 +193,8 @@ class AdaptiveOptimizer(Optimizer):
     that stays below 2/3 of it multiplies it. The rate keeps between 1e-6 and 20 times the first one.
     """
 
+    most = 20.0
+
     def __init__(self, cfg: DictConfig, name: str, module: nn.Module) -> None:
         super().__init__(cfg, name, module)
         if cfg[name].max_kl is None:
@@ -211,7 +211,17 @@ class AdaptiveOptimizer(Optimizer):
             if moved > self.limit:
                 group["lr"] = max(group["lr"] / 1.5, 1e-6)
             elif moved < self.limit / 2.25:
-                group["lr"] = min(group["lr"] * 1.5, 20.0 * self.first_lr)
+                group["lr"] = min(group["lr"] * 1.5, self.most * self.first_lr)
+
+
+class SteadyOptimizer(AdaptiveOptimizer):
+    """The same with a limit of ``max_kl`` that does not fall, for a run of any length; ``lr`` is its greatest rate."""
+
+    most = 1.0
+
+    def anneal(self, iteration: float) -> None:
+        """Set the limit, the same in every iteration."""
+        self.limit = self.max_kl
 
 
 class ReturnScale(nn.Module):

@@ -8,8 +8,8 @@ from omegaconf import DictConfig
 from torchrl_quad import AHACLoss, differentiable_rollout, make_value, restart
 from torchrl_quad.training.building import (
     Optimizer,
+    PatientOptimizer,
     ReturnScale,
-    SteadyOptimizer,
     make_loss,
     mean_of_all,
     set_up,
@@ -24,11 +24,11 @@ from torchrl_quad.training.loop import Run
 def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
     loss = make_loss(AHACLoss, cfg, env, actor, make_value, horizon=cfg.horizon)
-    actor_optimizer, critic_optimizer = SteadyOptimizer(cfg, "actor", loss), Optimizer(cfg, "critic", loss)
+    actor_optimizer, critic_optimizer = PatientOptimizer(cfg, "actor", loss), Optimizer(cfg, "critic", loss)
     bound, scale = trust_region(cfg, actor), ReturnScale(loss)
     run = Run(cfg, env, actor, loss, [actor_optimizer, critic_optimizer, scale])
     for _ in run:
-        run.horizon = loss.horizon
+        run.horizon, bound.max_kl = loss.horizon, actor_optimizer.limit_to(run.patience)
         # The actor: up the return of one horizon and the value of its end, through the dynamics.
         rollout, end = differentiable_rollout(env, actor, run.carry, run.horizon)
         scale.divide(rollout)

@@ -24,7 +24,7 @@ from torchrl_quad.training.building import (
     minibatches,
     shuffled,
 )
-from torchrl_quad.training.evaluation import last_rise, levelled_off
+from torchrl_quad.training.evaluation import last_rise, patience_left
 from torchrl_quad.training.loop import backward
 
 
@@ -103,12 +103,12 @@ def test_rewards_in_any_unit_are_divided_by_the_size_of_returns_and_critics_keep
     assert scale.value.item() == pytest.approx(unit * ((16 + 4) / 2) ** 0.5, rel=1e-6)
 
 
-def test_a_run_has_levelled_off_when_no_evaluation_has_risen_for_a_share_of_it():
+def test_patience_with_a_run_falls_while_no_evaluation_rises():
     returns = [-10.0, 90.0, 90.9, 91.1, 91.9, *[92.0] * 5]  # a rise is 1 % of the range, 1: at the fourth step
     curve = [{"steps": 10 * i, "eval/return": x, "eval/solved": 0.0} for i, x in enumerate(returns, 1)]
     assert [last_rise(curve[:n]) for n in range(1, 11)] == [10, 20, 20, 40, 40, 40, 40, 40, 40, 40]
-    assert not levelled_off(curve, None) and not levelled_off(curve, 0.6) and levelled_off(curve, 0.5)
-    assert not levelled_off(curve[:9], 0.5)  # too few evaluations to say
+    assert [patience_left(curve, x) for x in (None, 0.8, 0.6, 0.5)] == [1.0, pytest.approx(0.25), 0.0, 0.0]
+    assert patience_left(curve[:9], 0.5) == 1.0  # too few evaluations to say
     curve[7]["eval/solved"] = 0.02
     assert last_rise(curve) == 80 and last_rise([*curve, curve[-1] | {"eval/return": float("nan")}]) == 80
 

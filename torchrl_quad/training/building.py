@@ -54,13 +54,12 @@ def mean_of_all(x: Tensor) -> Tensor:
     return cat_all(x.detach().view(1)).mean()
 
 
-def any_of_all(x: bool) -> bool:
-    """Whether something is true in any of the processes."""
-    if world_size() == 1:
-        return x
-    found: list[Any] = [None] * world_size()
-    dist.all_gather_object(found, x)
-    return any(found)
+def of_first(x: float) -> float:
+    """The number that the first of the processes has."""
+    values = [x]
+    if world_size() > 1:
+        dist.broadcast_object_list(values)
+    return values[0]
 
 
 def own_seed(cfg: DictConfig) -> int:
@@ -214,14 +213,20 @@ class AdaptiveOptimizer(Optimizer):
                 group["lr"] = min(group["lr"] * 1.5, self.most * self.first_lr)
 
 
-class SteadyOptimizer(AdaptiveOptimizer):
-    """The same with a limit of ``max_kl`` that does not fall, for a run of any length; ``lr`` is its greatest rate."""
+class PatientOptimizer(AdaptiveOptimizer):
+    """The same for a run of any length: the limit is ``max_kl`` times the patience that is left, and ``lr`` the greatest
+    rate.
+    """
 
     most = 1.0
 
     def anneal(self, iteration: float) -> None:
-        """Set the limit, the same in every iteration."""
-        self.limit = self.max_kl
+        """Nothing: the recipe calls ``limit_to``."""
+
+    def limit_to(self, patience: float) -> float:
+        """Set the limit of an iteration, by the share of the patience that is left, and return it."""
+        self.limit = self.max_kl * max(patience, 0.02)
+        return self.limit
 
 
 class ReturnScale(nn.Module):

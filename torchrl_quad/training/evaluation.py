@@ -72,9 +72,14 @@ def last_rise(rows: Sequence[Mapping[str, float]]) -> int:
     return rose
 
 
-def levelled_off(rows: Sequence[Mapping[str, float]], patience: float | None, least: int = 10) -> bool:
-    """Whether no evaluation has risen for a share ``patience`` of the run, of ``least`` evaluations or more."""
-    return patience is not None and len(rows) >= least and last_rise(rows) < (1.0 - patience) * rows[-1]["steps"]
+def patience_left(rows: Sequence[Mapping[str, float]], patience: float | None, least: int = 10) -> float:
+    """What is left of the patience with a run: 1 if the last evaluation rose, 0 if none has for a share ``patience``.
+
+    It is 1 for a run of fewer than ``least`` evaluations, and where ``patience`` is None.
+    """
+    if patience is None or len(rows) < least:
+        return 1.0
+    return max(1.0 - (1.0 - last_rise(rows) / rows[-1]["steps"]) / patience, 0.0)
 
 
 @contextlib.contextmanager

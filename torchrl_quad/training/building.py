@@ -214,9 +214,7 @@ class AdaptiveOptimizer(Optimizer):
 
 
 class PatientOptimizer(AdaptiveOptimizer):
-    """The same for a run of any length: the limit is ``max_kl`` times the patience that is left, and ``lr`` the greatest
-    rate.
-    """
+    """The same for a run of any length: its limit is ``max_kl`` times the patience that is left; ``lr`` is the most."""
 
     most = 1.0
 

@@ -107,6 +107,7 @@ SETTINGS: dict[str, tuple[Any, str]] = {
     "buffer.fraction": (Fraction | None, "The share of horizons that start in visited states; null for none."),
     "eval.interval": (Size, "Iterations between evaluations; for only the last one, write 10000000."),
     "eval.episodes": (Size | None, "Episodes of each evaluation, at least; null for one of each drone."),
+    "eval.patience": (Below1 | None, "The run ends when no evaluation has risen for this share of it; null: never."),
     "eval.seed": (_Seed, ""),
     "logger.backend": (Literal["wandb", "tensorboard", "csv"] | None, ""),
     "logger.project": (str, ""),
@@ -150,6 +151,7 @@ PPO: dict[str, tuple[Any, str]] = {
 LOSSES: dict[str, type | None] = {
     **{"abpt": ABPTLoss, "ahac": AHACLoss, "bptt": BPTTLoss, "hybrid": HybridLoss},
     **{"pods": PODSLoss, "sapo": SAPOLoss, "shac": SHACLoss},
+    "train": AHACLoss,
     "ppo": None,  # TorchRL's
 }
 # What a recipe builds its loss with itself.
@@ -158,7 +160,7 @@ SET_BY_LOOPS = {"horizon", "average", "reduction", "delay_value", "delay_qvalue"
 IDLE: list[tuple[str, Callable[[Any], bool], str]] = [
     ("actor.final_lr", lambda c: c["actor"]["schedule"] == "constant", "actor.schedule=constant"),
     ("critic.final_lr", lambda c: c["critic"]["schedule"] == "constant", "critic.schedule=constant"),
-    ("actor.schedule actor.final_lr", lambda c: c["algorithm"] == "hybrid", "actor.max_kl sets the rate"),
+    ("actor.schedule actor.final_lr", lambda c: c["algorithm"] in ("hybrid", "train"), "actor.max_kl sets the rate"),
     ("actor.input_scale critic.input_scale", lambda c: c["normalize"], "normalize=true"),
     ("actor.channels", lambda c: c["env"].get("camera") is None, "env.camera=null"),
     ("actor.vision", lambda c: c["env"].get("camera") is None and c["actor"]["vision"], "env.camera=null"),

@@ -65,7 +65,8 @@ class PID(Quadrotor):
         ValueError: actions command something else than body rates.
     """
 
-    sizes, loop = {**Quadrotor.sizes, "rate_integral": 3}, PIDController
+    sizes = {**Quadrotor.sizes, "rate_integral": 3}
+    loop: type[PIDController] = PIDController
 
     def finish(self) -> None:
         """Refuse other controllers than that of body rates, whose place this one takes."""
@@ -103,7 +104,8 @@ class Betaflight(PID):
         ValueError: actions command something else than body rates.
     """
 
-    sizes, loop = {**PID.sizes, "slow_rate": 3}, FirmwareController
+    sizes = {**PID.sizes, "slow_rate": 3}
+    loop: type[PIDController] = FirmwareController
 
     def finish(self) -> None:
         """Work out the filter."""

@@ -17,7 +17,8 @@ class Perch(LandingEnv):
         return norm(rotate(state["quaternion"], self.tensor([[0.0, 0.0, 1.0]])) - self.tensor([-(0.75**0.5), 0.0, 0.5]))
 
     def touch(self, state):
-        return self.weights["touch"] * (-2.0 * self.lean(state)).exp()
+        fast = (norm(state["velocity"]) - 1.0).clamp_min(0.0)
+        return self.weights["touch"] * (-2.0 * self.lean(state) - fast).exp()
 
     def reward_terms(self, state):
         near, way = (5.0 * state["position"][..., :1]).clamp_max(0.0).exp(), state["target"] - state["position"]

@@ -58,7 +58,7 @@ def test_a_compiled_run_learns_what_an_eager_one_does(train, no_pictures, tmp_pa
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_every_recipe_trains_on_its_tasks_and_leaves_what_it_promises(launch, no_pictures, recipe, tmp_path):
     tasks = TASKS if recipe == "abpt" else ["landing", "forest"]  # the others differ in their losses alone
-    tasks = ["landing"] if recipe in ("sapo", "ahac", "hybrid", "train") else tasks
+    tasks = ["landing"] if recipe in ("sapo", "ahac", "hybrid", "pods", "train") else tasks
     sweep = [f"task={','.join(tasks)}", f"hydra.sweep.dir={tmp_path}", "hydra.sweep.subdir=${task}"]
     memory = [] if recipe in ("abpt", "bptt") else ["actor.recurrent=true", "actor.hidden_size=8"]
     printed = launch(recipe, "--multirun", *SMALL, *memory, *sweep, "hydra/launcher=basic")

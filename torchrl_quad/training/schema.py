@@ -18,7 +18,7 @@ from omegaconf import DictConfig, MissingMandatoryValue, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
-from torchrl_quad import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss
+from torchrl_quad import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, PODSLoss, SAPOLoss, SHACLoss
 from torchrl_quad.envs import task_class
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.objectives import PathwiseLoss
@@ -149,7 +149,8 @@ PPO: dict[str, tuple[Any, str]] = {
     "max_importance_ratio": (Positive | None, "The largest ratio of probabilities; null for any."),
 }
 LOSSES: dict[str, type | None] = {
-    **{"abpt": ABPTLoss, "ahac": AHACLoss, "bptt": BPTTLoss, "hybrid": HybridLoss, "sapo": SAPOLoss, "shac": SHACLoss},
+    **{"abpt": ABPTLoss, "ahac": AHACLoss, "bptt": BPTTLoss, "hybrid": HybridLoss},
+    **{"pods": PODSLoss, "sapo": SAPOLoss, "shac": SHACLoss},
     "train": AHACLoss,
     "ppo": None,  # TorchRL's
 }

@@ -3,7 +3,8 @@
 python -m benchmarks.controllers --checkpoints outputs/.../checkpoint.pt ...   # and fills in docs/controllers.md
 
 All fly the same fresh starts, as the recipes configure each task. In "other drones" mass and motors are drawn at random
-in each episode, which neither the controllers nor the policies know. A time is the median of single calls.
+in each episode, which neither the controllers nor the policies know. A time is the median of single calls. MPC is
+compiled.
 """
 
 import argparse
@@ -19,6 +20,7 @@ from torchrl.envs import EnvBase
 from benchmarks.laps import racing
 from benchmarks.report import command_line, publish, save
 from torchrl_quad import MPC, GeometricController
+from torchrl_quad.engine import has_compiler
 from torchrl_quad.files import read_rows
 from torchrl_quad.training.building import build_env
 from torchrl_quad.training.configuration import compose
@@ -62,14 +64,16 @@ def measure(task: str, name: str, checkpoint: str | None, args: argparse.Namespa
     def policy(env: EnvBase) -> TensorDictModuleBase:
         if learned:
             return learned[1]
-        return CONTROLLERS[name](env, reference=racing(env) if task == "racing" else None)
+        controller = CONTROLLERS[name](env, reference=racing(env) if task == "racing" else None)
+        if name == "mpc" and has_compiler():
+            controller.compile()
+        return controller
 
     if learned and learned[2] is not None:
         raise SystemExit(f"{checkpoint} has a normaliser: give checkpoints without one.")
-    starts = args.mpc_starts if name == "mpc" else args.starts
-    row: dict[str, Any] = {"task": task, "policy": name, "starts": starts}
+    row: dict[str, Any] = {"task": task, "policy": name, "starts": args.starts}
     for suffix, changes in (("", {}), (", other drones", {"randomize": OTHER_DRONES})):
-        env = build_env(configuration(task, args.steps, **changes), starts, SEED)
+        env = build_env(configuration(task, args.steps, **changes), args.starts, SEED)
         metrics, _ = evaluate(env, policy(env))
         row[f"solved{suffix}"] = round(metrics["eval/solved"], 4)
         row[f"crash{suffix}"] = round(metrics["eval/crash"], 4)
@@ -100,7 +104,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     options = {"tasks": TASKS, "controllers": list(CONTROLLERS), "checkpoints": [], "starts": 256, "calls": 100}
-    options |= {"mpc_starts": 64, "steps": 0}  # it thinks long; 0 is an episode as the recipes have it
+    options |= {"steps": 0}  # 0 is an episode as the recipes have it
     args = command_line(__doc__, "controllers.csv", **options)
     trained = [(cfg.task, cfg.algorithm, path) for path in args.checkpoints for cfg in [load_policy(Path(path))[0]]]
     jobs = [(task, name, path) for task, name, path in trained if task in args.tasks]

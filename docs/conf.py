@@ -23,7 +23,7 @@ project = "torchrl_quad"
 version = release = torchrl_quad.__version__
 root_doc = "docs/index"
 include_patterns = ["docs/**.md", "docs/_api/*.rst", "recipes/README.md", "CONTRIBUTING.md"]
-include_patterns += ["examples/*", "examples/data/README.md"]
+include_patterns += ["examples/*", "examples/data/README.md", "examples/tasks/README.md"]
 exclude_patterns = ["docs/_build", ".venv", ".git"]
 extensions = [
     "myst_parser",

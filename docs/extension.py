@@ -70,7 +70,7 @@ class ExampleParser(MystParser):
 def add_examples(app: Sphinx, docname: str, source: list[str]) -> None:
     """Put the pages of the examples under the page that lists them."""
     if docname == "examples/README":
-        source[0] += "\n```{toctree}\n:hidden:\n:glob:\n\n[0-9]*\n```\n"
+        source[0] += "\n```{toctree}\n:hidden:\n:glob:\n\ntasks/README\n[0-9]*\n```\n"
 
 
 def link_to_sources(app: Sphinx, doctree: nodes.document) -> None:

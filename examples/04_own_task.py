@@ -1,5 +1,4 @@
 """Your own task: fly through a ring that swings from side to side. It needs no spec, no mask and no detach."""
-# ruff: noqa: D102, the docstrings of the methods are in Task
 
 import torch
 

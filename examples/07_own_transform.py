@@ -1,5 +1,4 @@
 """Write a transform between task and policy that gradients pass: the target in the drone's body frame."""
-# ruff: noqa: D102, the methods are those of Transform
 
 import torch
 from torchrl.data import Unbounded

@@ -1,5 +1,4 @@
 """Write a disturbance as one class: a battery that runs down, and thrust that falls with its voltage."""
-# ruff: noqa: D102, the docstrings of the methods are in Disturbance
 
 import torch
 

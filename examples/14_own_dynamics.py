@@ -1,5 +1,4 @@
 """Write a dynamics model as one class: a drone whose autopilot follows velocity commands."""
-# ruff: noqa: D102, the docstrings of the methods are in Dynamics
 
 import torch
 

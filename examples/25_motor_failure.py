@@ -1,5 +1,4 @@
 """Stop a motor of a hexarotor at a random time, and train a policy with a memory to land in spite of it."""
-# ruff: noqa: D102, the docstrings of the methods are in Disturbance
 
 import torch
 from torch.nn.functional import one_hot

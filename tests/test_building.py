@@ -14,9 +14,17 @@ from torchrl.trainers import DefaultOptimizationStepper, Trainer, UpdateWeights
 
 from torchrl_quad import DifferentiableCollector, HoveringEnv, differentiable_rollout
 from torchrl_quad.modules import make_actor, make_qvalue, make_value
-from torchrl_quad.objectives import ABPTLoss, BPTTLoss, SHACLoss
+from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, SHACLoss
 from torchrl_quad.training import building
-from torchrl_quad.training.building import AdaptiveOptimizer, Optimizer, TargetUpdate, minibatches, shuffled
+from torchrl_quad.training.building import (
+    AdaptiveOptimizer,
+    Optimizer,
+    ReturnScale,
+    TargetUpdate,
+    minibatches,
+    shuffled,
+)
+from torchrl_quad.training.evaluation import last_rise, patience_left
 from torchrl_quad.training.loop import backward
 
 
@@ -70,6 +78,39 @@ def test_a_schedule_goes_from_the_first_to_the_last_learning_rate(schedule, half
     for iteration, rate in ((0, 1e-2), (49.5, halfway), (99, last), (200, last)):
         adam.anneal(iteration)
         assert adam.param_groups[0]["lr"] == pytest.approx(rate)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+def test_rewards_in_any_unit_are_divided_by_the_size_of_returns_and_critics_keep_what_they_say(unit):
+    torch.manual_seed(0)
+    env = HoveringEnv(num_envs=2, seed=0)
+    loss = AHACLoss(actor := make_actor(env), make_value(env))
+    scale, rollout = ReturnScale(loss), differentiable_rollout(env, actor, None, 3)[0]
+    for size in (4.0, 2.0):  # of all targets, in the reward's unit
+        before = scale.value
+        reward = unit * torch.ones(2, 3, 1, requires_grad=True)
+        data = rollout.detach().set(("next", "reward"), reward)
+        scale.divide(data)
+        torch.testing.assert_close(data["next", "reward"].double() * before, reward.double())
+        assert data["next", "reward"].requires_grad
+        data = data.detach().set("value_target", torch.full((2, 3, 1), size * unit) / before.float())
+        said = loss._critics(data) * before
+        scale.update(data)
+        torch.testing.assert_close(loss._critics(data) * scale.value, said, rtol=1e-5, atol=1e-6 * unit)
+        torch.testing.assert_close(
+            data["value_target"].double() * scale.value, torch.full((2, 3, 1), size * unit).double()
+        )
+    assert scale.value.item() == pytest.approx(unit * ((16 + 4) / 2) ** 0.5, rel=1e-6)
+
+
+def test_patience_with_a_run_falls_while_no_evaluation_rises():
+    returns = [-10.0, 90.0, 90.9, 91.1, 91.9, *[92.0] * 5]  # a rise is 1 % of the range, 1: at the fourth step
+    curve = [{"steps": 10 * i, "eval/return": x, "eval/solved": 0.0} for i, x in enumerate(returns, 1)]
+    assert [last_rise(curve[:n]) for n in range(1, 11)] == [10, 20, 20, 40, 40, 40, 40, 40, 40, 40]
+    assert [patience_left(curve, x) for x in (None, 0.8, 0.6, 0.5)] == [1.0, pytest.approx(0.25), 0.0, 0.0]
+    assert patience_left(curve[:9], 0.5) == 1.0  # too few evaluations to say
+    curve[7]["eval/solved"] = 0.02
+    assert last_rise(curve) == 80 and last_rise([*curve, curve[-1] | {"eval/return": float("nan")}]) == 80
 
 
 def test_the_gradient_of_alpha_takes_nothing_of_the_actor_s_norm():

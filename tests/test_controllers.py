@@ -136,6 +136,9 @@ def test_a_step_of_gauss_newton_never_raises_the_cost_and_its_derivatives_are_fi
         change[i] = h
         up, down = (mpc.step(states[:-1] + s * change[:17], inner + s * change[17:]) for s in (1, -1))
         torch.testing.assert_close(derivatives[..., i], (up - down) / (2 * h), rtol=1e-4, atol=1e-5)
+    mpc.compile(backend="eager")
+    torch.testing.assert_close(mpc.linearise(states[:-1], inner), derivatives)
+    torch.testing.assert_close(mpc.predict(states[0], actions), states)
 
 
 def test_the_backward_pass_solves_the_linear_quadratic_problem():

@@ -1,6 +1,8 @@
 """The make-up of rewards and policy gradients, against numbers worked by hand and the paper's table I."""
 
+import functools
 import math
+import re
 
 import pytest
 import torch
@@ -13,6 +15,7 @@ from torchrl.envs import PendulumEnv
 
 from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_env, make_qvalue, make_value
 from torchrl_quad.diagnostics import audit_reward, compare_gradients, gradient_by_horizon, gradient_statistics
+from torchrl_quad.envs.terms import distance
 from torchrl_quad.objectives import ABPTLoss, BPTTLoss, SHACLoss
 
 
@@ -96,7 +99,7 @@ def test_an_audit_needs_no_gradient_mode_and_counts_no_gradient_that_is_not_fini
 
 def fly(task, horizon=24, **options):
     """A horizon in which every term is paid: drones above and beside the pad, before a gate, and in free flight."""
-    env = make_env(task, num_envs=6, seed=0, **options)
+    env = (functools.partial(make_env, task) if isinstance(task, str) else task)(num_envs=6, seed=0, **options)
     td = env.reset()
     state = td["state"]
     if task == "landing":
@@ -113,15 +116,15 @@ def fly(task, horizon=24, **options):
 
 
 @cases(
-    ("hovering", {}, []),
-    ("tracking", {}, []),
-    ("landing", {}, ["success", "crash"]),
-    ("racing", {"reward": "position"}, ["gate"]),
-    ("racing", {"reward": "velocity"}, ["gate"]),
-    ("racing", {"gate_bonus": "log"}, []),
-    ("racing", {"reward": "velocity", "gate_bonus": "reciprocal"}, []),
+    ("hovering", {}, [], ["'attitude'"]),  # whose weight the paper chose
+    ("tracking", {}, [], ["'attitude'"]),
+    ("landing", {}, ["success", "crash"], []),
+    ("racing", {"reward": "position"}, ["gate"], ["'attitude'"]),
+    ("racing", {"reward": "velocity"}, ["gate"], []),
+    ("racing", {"gate_bonus": "log"}, [], ["gate,", "a"]),  # it falls at each gate, and steps pay less than nothing
+    ("racing", {"reward": "velocity", "gate_bonus": "reciprocal"}, [], ["gate,"]),
 )
-def test_the_audit_finds_which_rewards_are_fully_and_which_are_partially_differentiable(task, options, without):
+def test_the_audit_finds_which_rewards_are_fully_and_which_are_partially_differentiable(task, options, without, traps):
     rollout, actor = fly(task, **options)
     audit = audit_reward(rollout, actor, gamma=0.99)
     assert audit.without_gradient == without
@@ -130,11 +133,61 @@ def test_the_audit_finds_which_rewards_are_fully_and_which_are_partially_differe
         assert term.verdict == expected, f"{name}\n{audit}"
     assert sum(term.return_share for term in audit.values()) == pytest.approx(1.0)
     assert sum(term.gradient_share for term in audit.values()) == pytest.approx(1.0)
+    assert [trap.split()[0] for trap in audit.traps] == traps, audit
     if task != "hovering":
         return
     for key in ("action", ("state", "quaternion")):  # the first state has no graph
         by_entry = audit_reward(rollout, rollout[key])
         assert [term.verdict for term in by_entry.values()] == [term.verdict for term in audit.values()]
+
+
+class DoubtfulEnv(HoveringEnv):
+    """Hovering that ends with a bonus, and pays for being near: both well or badly, as the weights say."""
+
+    ends_on_success = True
+    weights = {**HoveringEnv.weights, "attitude": 0.0, "arrival": 20.0, "near": 0.0, "width": 1.0}
+    start_range = (1.0, 0.5, 0.5)
+
+    def initial_state(self, n):
+        start = super().initial_state(n)
+        start["velocity"] = start["target"] - start["position"]
+        return start
+
+    def reward_terms(self, state):
+        arrival = self.weights["arrival"] * self.is_success(state)
+        near = self.weights["near"] * (-((distance(state) / self.weights["width"]) ** 2)).exp()
+        return {**super().reward_terms(state), "arrival": arrival, "near": near}
+
+
+@cases(
+    (
+        "racing",
+        {"reward": "position"},
+        {"gate": 0.0, "attitude": 0.0},
+        "gate, target.* waiting before an arrival pays",
+    ),
+    (
+        DoubtfulEnv,
+        {"success_radius": 0.5},
+        {"arrival": 1.0},
+        "success ends an episode and pays 1.0.* loitering pays more",
+    ),
+    (HoveringEnv, {}, {"survival": 0.0, "attitude": 0.0}, "a step pays -0.0.* crash was not seen: dying is cheap"),
+    (
+        DoubtfulEnv,
+        {},
+        {"near": 10.0, "width": 0.08},
+        "'near' is flat in .* of the flights, those in which it pays least",
+    ),
+    (HoveringEnv, {}, {}, "'attitude' is less than a thousandth of return and gradient"),
+)
+def test_the_audit_says_in_words_what_keeps_a_policy_from_learning_a_task(task, options, weights, trap, monkeypatch):
+    for name in options.keys() & {"success_radius"}:
+        monkeypatch.setattr(task, name, options.pop(name))
+    audit = audit_reward(*fly(task, 12, weights=weights, **options), gamma=0.99)
+    (said,) = audit.traps
+    assert re.match(trap, said), said
+    assert f"trap: {said}" in repr(audit)
 
 
 def shac(rollout_and_actor, critic, **options):

@@ -19,6 +19,7 @@ from test_examples import EXAMPLES, reduced
 from torchrl_quad.envs import TASKS
 
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "recipes/README.md", "examples/README.md")]
+PAGES += [ROOT / "examples/tasks/README.md"]
 PAGES += sorted(path for path in ROOT.glob("docs/**/*.md") if "_build" not in path.parts)
 PARTS = {path.parent.name for path in ROOT.glob("torchrl_quad/*/__init__.py")} - {"training"}  # which recipes use
 PUBLIC = ["torchrl_quad", *(f"torchrl_quad.{part}" for part in sorted(PARTS))]

@@ -7,6 +7,9 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_quad import audit_reward, differentiable_rollout, make_actor, make_env
 
 EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("*.py"))
 BUDGET = re.compile(r"^(STEPS|ITERATIONS) = [\d_]+$", flags=re.MULTILINE)
@@ -33,6 +36,24 @@ def test_every_example_runs(example, tmp_path, monkeypatch):
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
 def test_every_example_is_short(example):
     assert len(example.read_text().splitlines()) < 60
+
+
+TASKS = sorted((EXAMPLES[0].parent / "tasks").glob("*.py"))
+ATTITUDE = "'attitude' is less than a thousandth of return and gradient: it teaches nothing"
+
+
+@pytest.mark.parametrize("task", TASKS, ids=lambda path: path.stem)
+def test_every_task_of_the_gallery_is_short_and_listed_keeps_the_rules_and_its_reward_has_no_trap(task):
+    readme = task.parent / "README.md"
+    assert len(task.read_text().splitlines()) <= 40 and f"[{task.stem}]({task.name})" in readme.read_text()
+    assert sum(path.stat().st_size for path in task.parent.glob("*.png")) < 400_000
+    env = make_env(f"examples.tasks.{task.stem}.{task.stem.title()}", num_envs=2, seed=0)
+    check_env_specs(env)
+    actor = make_actor(env)
+    rollout, _ = differentiable_rollout(env, actor, env.reset(), 8)
+    audit = audit_reward(rollout, actor, gamma=0.99)
+    assert [x for x in audit.traps if x != ATTITUDE] == []  # the paper's weight, where a task has the paper's reward
+    assert {x.verdict for x in audit.values()} <= {"differentiable", "constant", "not seen"}
 
 
 @pytest.mark.slow

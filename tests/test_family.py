@@ -6,6 +6,7 @@ import pickle
 import pytest
 import torch
 from refusals import refuses
+from tensordict import TensorDict
 from test_objectives import GAMMA, LAMBDA, REWARDS, make_abpt, make_networks, make_rollout, td_lambda
 from torch.distributions import Normal
 from torchrl.envs import EnvBase
@@ -13,8 +14,16 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import TanhNormal
 from torchrl.objectives import ValueEstimators
 
-from torchrl_quad import HoveringEnv, HybridLoss, differentiable_rollout, make_actor, make_qvalue, make_value
-from torchrl_quad.objectives import ABPTLoss, AHACLoss, SAPOLoss, SHACLoss
+from torchrl_quad import (
+    ActionSequence,
+    HoveringEnv,
+    HybridLoss,
+    differentiable_rollout,
+    make_actor,
+    make_qvalue,
+    make_value,
+)
+from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, PODSLoss, SAPOLoss, SHACLoss
 from torchrl_quad.objectives.calls import plain_of
 
 ENTROPY = [-3.0, -1.0, 1.0, 3.0]  # of the four steps, in both environments
@@ -89,6 +98,78 @@ def test_the_gradient_of_sapo_is_that_of_finite_differences(env64, clip):
         weight.data[entry] += 1e-6
         numeric = (ends[0] - ends[1]) / 2e-6
         assert grad[entry].item() == pytest.approx(numeric, rel=1e-6 if clip is None else 2e-2, abs=1e-8)
+
+
+# -- PODS --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_pods_asks_for_the_actions_that_raise_the_return(order):
+    """x' = x + a, a = x, and a reward of -x'^2 / 2: from 1 to 2 to 4. The best is x = 0 after one step, and to stay."""
+    actor, _, _ = make_networks(policy=1.0)
+    positions, actions = [torch.ones(1, 1).double()], []
+    for _ in range(2):
+        actions.append(positions[-1] * torch.ones(1, requires_grad=True).double())
+        positions.append(positions[-1] + actions[-1])
+    rollout = TensorDict({"observation": torch.stack(positions[:2], 1), "action": torch.stack(actions, 1)}, [1, 2])
+    ends = dict.fromkeys(("done", "terminated"), torch.zeros(1, 2, 1, dtype=torch.bool))
+    rollout["next"] = TensorDict({"reward": -0.5 * torch.stack(positions[1:], 1) ** 2, **ends}, [1, 2])
+    loss = PODSLoss(actor, order=order, step=1e9 if order == 2 else 0.1, clip_action_gradient=None).double()
+    loss.make_value_estimator(gamma=1.0)
+    change = (loss.write_action_target(rollout)["action_target"] - rollout["action"])[0, :, 0]
+    # The gradients are -(2 + 2 * 4) and -4: their median, the lower one, is a change of 0.1. The policy doubles x.
+    assert change.tolist() == pytest.approx([-2.0, 0.0] if order == 2 else [-0.25, -0.1], abs=1e-6)
+
+
+def test_the_second_order_of_pods_is_that_of_the_dynamics():
+    torch.manual_seed(0)
+    env = HoveringEnv(num_envs=2, seed=0, dtype=torch.float64)
+    actor = make_actor(env)
+    for x in actor.parameters():  # the same action everywhere, so that it reacts to nothing
+        x.data.zero_()
+    start, steps = env.reset(), 4
+    loss = PODSLoss(actor, order=2, step=0.02, iterations=100, clip_action_gradient=None)
+    rollout, _ = differentiable_rollout(env, actor, start.clone(), steps)
+    change = (loss.write_action_target(rollout)["action_target"] - rollout["action"]).detach()
+
+    def returned(actions):
+        flight = env.rollout(steps, ActionSequence(actions.movedim(-2, 0)), tensordict=start.clone(), auto_reset=False)
+        return (loss._discounts(flight) * flight["next", "reward"]).sum()
+
+    flown = rollout["action"].detach()
+    gradient, hessian = torch.func.grad(returned)(flown), torch.autograd.functional.hessian(returned, flown)
+    damping = gradient.norm(dim=-1)[gradient.norm(dim=-1) > 0].median() / 0.02
+    matrix = damping * torch.eye(flown.numel()).double() - hessian.reshape(flown.numel(), -1)
+    expected = torch.linalg.solve(matrix, gradient.flatten()).view_as(change)
+    torch.testing.assert_close(change, expected)
+    assert (expected - gradient / damping).abs().max() > 0.01 * expected.abs().max()  # the second order tells
+
+
+def test_one_step_of_pods_goes_where_backpropagation_through_time_goes(env64):
+    actor = make_actor(env64)
+    rollout, _ = differentiable_rollout(env64, actor, None, 5)
+    pods, bptt = PODSLoss(actor, step=0.3, clip_action_gradient=2.0), BPTTLoss(actor, clip_action_gradient=2.0)
+    flight = pods.write_action_target(rollout.copy()).detach()
+    grads = [
+        torch.cat(
+            [
+                x.flatten()
+                for x in torch.autograd.grad(loss, list(actor.parameters()), allow_unused=True)
+                if x is not None
+            ]
+        )
+        for loss in (pods.loss_actor(flight)[0], bptt.loss_actor(rollout)[0])
+    ]
+    torch.testing.assert_close(grads[0] / grads[0].norm(), grads[1] / grads[1].norm())
+    compiled = HoveringEnv(num_envs=2, compile={"backend": "eager"})
+    other = make_actor(compiled)
+    flown, _ = differentiable_rollout(compiled, other, None, 3)
+    refuses(
+        "differentiates twice, and a compiled flight only once: call env.eager",
+        PODSLoss(other, order=2),
+        flown,
+        error=NotImplementedError,
+    )
 
 
 # -- AHAC --------------------------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from torchrl_quad.engine import ActionSequence
 from torchrl_quad.envs import ForestEnv
 from torchrl_quad.errors import UserError, UserTypeError, UserValueError
 from torchrl_quad.modules import make_actor, make_qvalue, make_value, make_visual_actor
-from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss
+from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, PODSLoss, SAPOLoss, SHACLoss
 from torchrl_quad.options import declared
 
 HOSTILE = [
@@ -51,6 +51,7 @@ def calls():
         "sapo": (SAPOLoss, with_value, CRITIC),
         "ahac": (AHACLoss, with_value, CRITIC),
         "hybrid": (HybridLoss, with_value, CRITIC),
+        "pods": (PODSLoss, {"actor_network": actor}, LOSS),
         "abpt": (ABPTLoss, {"actor_network": actor, "qvalue_network": make_qvalue(env)}, LOSS),
         "estimator": (shac.make_value_estimator, {}, []),
         "returns": (bptt.make_value_estimator, {}, []),

@@ -135,6 +135,18 @@ def test_a_recipe_outside_the_repository_is_short_and_takes_any_task(tmp_path, m
     assert math.isfinite(saved["best"]["return"])
 
 
+def test_a_task_may_have_other_defaults_of_arguments_that_callers_and_recipes_see_and_may_change():
+    class NearEnv(CornerEnv):
+        defaults = {"reach": 0.1, "drone": "racer", "num_envs": 3}
+
+    env = NearEnv()
+    assert (env.num_envs, env.reach, NearEnv(2, reach=0.3).reach, NearEnv(2).num_envs) == (3, 0.1, 0.3, 2)
+    assert "drone='racer'" in repr(env) and "drone='racer'" in repr(env.rebuilt(num_envs=2))
+    assert defaults(NearEnv) == {**defaults(CornerEnv), "reach": 0.1, "drone": "racer"}
+    NearEnv.defaults = {"drne": "racer"}
+    refuses("argument 'drne'. Did you mean 'drone'", NearEnv, error=TypeError)
+
+
 def test_a_metric_that_is_described_and_not_given_is_named():
     class SilentEnv(CornerEnv):
         def metrics(self, state):

@@ -40,6 +40,7 @@ SEEING = [  # and remembering: a memory, images on their way, and noise that goe
 @cases(
     *((recipe, [*EVERYTHING, *ENTROPY]) for recipe in ("abpt", "ahac", "shac", "sapo")),
     ("hybrid", EVERYTHING),
+    ("train", [*EVERYTHING, *ENTROPY]),
     ("ppo", ["normalize=true", *EVERYTHING[-3:], "compile=true"]),
     ("bptt", [*SEEING, *ENTROPY]),
 )
@@ -121,6 +122,19 @@ def test_resume_auto_starts_goes_on_and_leaves_alone_what_is_finished(train, lau
     assert longer["revision"] == f"{first['revision']}, then another"
     train("bptt", tmp_path, "resume=auto", "total_steps=240")
     assert json.loads((tmp_path / "summary.json").read_text())["steps"] == 240
+
+
+def test_a_run_ends_when_its_evaluation_has_levelled_off_says_so_and_goes_on_with_more_patience(
+    launch, no_pictures, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(loop, "evaluate", lambda *_: ({"eval/return": 1.0, "eval/solved": 1.0}, None))
+    options = [*SMALL, "eval.interval=1", "total_steps=480", f"hydra.run.dir={tmp_path}", "resume=auto"]
+    said = launch("bptt", *options, "eval.patience=0.5")
+    assert "Stopped before total_steps: no evaluation has risen since step 24.\n" in said
+    assert read_checkpoint(tmp_path / "checkpoint.pt")["iteration"] == len(rows(tmp_path)) == 10
+    assert launch("bptt", *options) == f"Finished before: {tmp_path}\n"
+    assert "Stopped" not in launch("bptt", *options, "eval.patience=null")
+    assert len(rows(tmp_path)) == 20
 
 
 def test_what_the_command_line_says_must_agree_with_the_checkpoint(train, refused, tmp_path):

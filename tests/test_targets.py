@@ -1,97 +1,163 @@
 """Code for a firmware compiles against its headers, as far as it uses them, and commands what the bundle does."""
 
+import re
 import subprocess
 
 import numpy as np
 import pytest
 from deploying import resting
+from refusals import cases, refuses
+from scipy.spatial.transform import Rotation
 
 from torchrl_quad.deploy import autopilots, frames, load_bundle
 from torchrl_quad.deploy.simulators.vehicle import Drone
-from torchrl_quad.deploy.targets import TARGETS, write_target
+from torchrl_quad.deploy.targets import write_target
 
-STATE = resting(position=[0.3, -0.2, 1.1], quaternion=[0.8, 0.2, -0.4, 0.4], velocity=[0.5, -0.3, 0.2])
-STATE["angular_velocity"] = [0.4, -0.6, 0.3]
-STUBS = {
-    "crazyflie": {
-        "app.h": "#pragma once\n#include <stdint.h>\n#include <stdio.h>\n#include <stdlib.h>\n#include <string.h>\n"
-        "#define PARAM_GROUP_START(x)\n#define PARAM_ADD(a, b, c)\n#define PARAM_GROUP_STOP(x)\n#define M2T(x) (x)\n"
-        "typedef uint32_t TickType_t; typedef int logVarId_t;\n"
-        "enum { modeVelocity = 2, COMMANDER_PRIORITY_EXTRX = 3 };\n"
-        "typedef struct { struct { float roll, pitch, yaw; } attitudeRate; float thrust;\n"
-        "  struct { int roll, pitch, yaw; } mode; } setpoint_t;\n"
-        "TickType_t xTaskGetTickCount(void); void vTaskDelay(TickType_t);\n"
-        "void vTaskDelayUntil(TickType_t *, TickType_t);\n"
-        "logVarId_t logGetVarId(const char *, const char *); float logGetFloat(logVarId_t);\n"
-        "void commanderSetSetpoint(const setpoint_t *, int);\n",
-        **{name: '#include "app.h"\n' for name in ("FreeRTOS.h", "commander.h", "log.h", "param.h", "task.h")},
-        "main.c": '#include "policy_crazyflie.c"\nstatic const char *all = "x y z vx vy vz qw qx qy qz ";\n'
-        "static const float values[] = {$all}; static int calls;\n"
-        "TickType_t xTaskGetTickCount(void) { return 0; }\nvoid vTaskDelay(TickType_t x) { (void)x; exit(1); }\n"
-        "void vTaskDelayUntil(TickType_t *t, TickType_t x) { if (x != 20) exit(2); (void)t; flies = calls++ > 0; }\n"
-        "logVarId_t logGetVarId(const char *group, const char *name) { char key[9]; int i = 0; const char *at = all;\n"
-        "  if (group[0] == 'g') return 10 + name[0] - 'x';\n  snprintf(key, sizeof key, \"%s \", name);\n"
-        "  while (strncmp(at, key, strlen(key))) { at = strchr(at, ' ') + 1; ++i; }\n  return i; }\n"
-        "float logGetFloat(logVarId_t i) { return values[i]; }\n"
-        'void commanderSetSetpoint(const setpoint_t *s, int p) { printf("%g %g %g %g\\n", s->attitudeRate.roll,\n'
-        "  s->attitudeRate.pitch, s->attitudeRate.yaw, s->thrust); exit(p != 3); }\nint main(void) { appMain(); }\n",
-    },
-    "px4": {
-        "uORB/topics/vehicle_attitude.h": "struct vehicle_attitude_s { unsigned long timestamp; float q[4]; };",
-        "uORB/topics/vehicle_local_position.h": "struct vehicle_local_position_s { float x, y, z, vx, vy, vz; };",
-        "uORB/topics/vehicle_angular_velocity.h": "struct vehicle_angular_velocity_s { float xyz[3]; };",
-        "uORB/topics/vehicle_rates_setpoint.h": "struct vehicle_rates_setpoint_s { unsigned long timestamp;\n"
-        "  float roll, pitch, yaw, thrust_body[3]; bool reset_integral; };",
-        "main.cpp": '#include <cstdio>\n#include "policy_px4.cpp"\nint main() {\n'
-        "  pilot_t pilot; policy_px4_start(pilot);\n"
-        "  vehicle_rates_setpoint_s s; const float x[] = {$all};\n"
-        "  policy_px4(pilot, {x[0], x[1], x[2], x[3], x[4], x[5]}, {0, {x[6], x[7], x[8], x[9]}},\n"
-        "    {{x[10], x[11], x[12]}},\n"
-        '    0.5f, s); std::printf("%g %g %g %g\\n", s.roll, s.pitch, s.yaw, s.thrust_body[2]); }\n',
-    },
-    "betaflight": {
-        "rx/rx.h": "#include <stdint.h>\ntypedef struct { int x; } rxRuntimeState_t;",
-        "main.c": '#include <stdio.h>\n#include "policy_betaflight.c"\nint main(void) { const float x[] = {$all};\n'
-        "  policyStart(); policyUpdate(x, x + 6, x + 3, x + 10);\n"
-        '  for (int i = 0; i < 4; ++i) printf("%g ", policyReadRawRC(0, (uint8_t)i)); }\n',
-    },
+STATES = [
+    {"position": [0.3, -0.2, 1.1], "quaternion": [0.8, 0.2, -0.4, 0.4], "velocity": [0.5, -0.3, 0.2]},
+    {"position": [1.4, 0.6, 1.3], "quaternion": [-0.5, 0.1, 0.1, 0.73**0.5], "velocity": [-1.0, 0.0, -0.6]},
+]
+RATE, NAMES = {"angular_velocity": [0.4, -0.6, 0.3]}, ("position", "velocity", "quaternion", "angular_velocity")
+FRAMES = {"crazyflie": frames.crazyflie(), "px4": frames.px4(), "betaflight": frames.betaflight()}
+FLAGS = "-O1 -Wall -Wextra -Werror -include stdint.h -include stdio.h -include stdlib.h -include string.h "
+FLAGS += "-DPARAM_GROUP_START(x)= -DPARAM_ADD(a,b,c)= -DPARAM_GROUP_STOP(x)= -DM2T(x)=x"
+MAIN = """
+int main(int n, char **given) { for (int i = 1; i < n; ++i) x[i - 1] = (float)atof(given[i]);
+  fly(); for (int i = 0; i < count; ++i) printf("%g ", said[i]); }
+"""
+OBSERVE = """
+void pilot_observe(const float a[3], const float b[4], const float c[3], const float d[3], float y[POLICY_OBSERVATION])
+{ (void)a, (void)b, (void)c, (void)d; memcpy(y, x + 13, POLICY_OBSERVATION * sizeof *y); }
+"""
+STUBS = {  # what its headers declare, then what calls the code
+    "crazyflie": """#include <setjmp.h>
+typedef uint32_t TickType_t; typedef int logVarId_t; enum { modeAbs = 1, modeVelocity, COMMANDER_PRIORITY_EXTRX };
+typedef struct { struct { float roll, pitch, yaw; } attitude, attitudeRate; struct { float x, y, z; } velocity;
+  float thrust; struct { float x, y, z, roll, pitch, yaw; } mode; } setpoint_t;
+static jmp_buf end; static const char *all = "x y z vx vy vz qw qx qy qz "; static int calls; static uint8_t flies;
+static TickType_t xTaskGetTickCount(void) { return 0; }
+static void vTaskDelay(TickType_t x) { (void)x; exit(1); }
+static void vTaskDelayUntil(TickType_t *t, TickType_t x) { if (x != 20) exit(2); (void)t; flies = calls++ > 0; }
+static logVarId_t logGetVarId(const char *group, const char *name) {
+  char key[9]; snprintf(key, sizeof key, "%s ", name); int i = 0;
+  for (const char *at = all; strncmp(at, key, strlen(key)); at = strchr(at, ' ') + 1) ++i;
+  return group[0] == 'g' ? 10 + i : i; }
+static float logGetFloat(logVarId_t i) { return x[i]; }
+static void commanderSetSetpoint(const setpoint_t *s, int p) { memcpy(said, s, sizeof *s); longjmp(end, p); }
+@
+static void fly(void) { count = 16; if (!setjmp(end)) appMain(); }""",
+    "px4": """
+struct vehicle_attitude_s { unsigned long timestamp; float q[4]; };
+struct vehicle_local_position_s { float x, y, z, vx, vy, vz; };
+struct vehicle_angular_velocity_s { float xyz[3]; };
+struct vehicle_rates_setpoint_s { float roll, pitch, yaw, thrust_body[3]; int timestamp; };
+struct vehicle_attitude_setpoint_s { float q_d[4], yaw_sp_move_rate, thrust_body[3]; int timestamp; };
+struct trajectory_setpoint_s { float position[3], velocity[3], acceleration[3], jerk[3], yaw, yawspeed; int timestamp;};
+@
+template <class S> static void send(bool call(pilot_t &, const vehicle_local_position_s &, const vehicle_attitude_s &,
+                                              const vehicle_angular_velocity_s &, float, S &)) {
+  pilot_t pilot; S s; policy_px4_start(pilot); count = sizeof s / sizeof(float) - 1;
+  const vehicle_local_position_s at = {x[0], x[1], x[2], x[3], x[4], x[5]};
+  if (!call(pilot, at, {0, {x[6], x[7], x[8], x[9]}}, {{x[10], x[11], x[12]}}, 0.5f, s)) exit(1);
+  memcpy(said, &s, count * sizeof(float)); }
+static void fly() { send(policy_px4); }""",
+    "betaflight": """
+typedef struct { int x; } rxRuntimeState_t;
+@
+static void fly(void) { policyStart(); policyUpdate(x, x + 6, x + 3, x + 10);
+  for (count = 0; count < 4; ++count) said[count] = policyReadRawRC(0, (uint8_t)count); }""",
 }
 
 
-@pytest.mark.parametrize("target", TARGETS)
-def test_code_for_a_firmware_compiles_and_commands_what_the_bundle_does(target, export_once, tmp_path):
-    bundle = load_bundle(export_once("hovering")[2])
-    (tmp_path / "policy").symlink_to(bundle.folder)
-    folder, stubs = write_target(tmp_path / "policy", target), tmp_path / "stubs"
-    names = ("position", "velocity", "quaternion", "angular_velocity")
-    frame = {"crazyflie": frames.crazyflie, "px4": frames.px4, "betaflight": frames.betaflight}[target]()
-    theirs = frame.to({name: STATE[name] for name in names})
-    if frame.xyzw:
-        theirs["quaternion"] = np.roll(theirs["quaternion"], 1)
-    if target == "crazyflie":
-        theirs["angular_velocity"] = np.degrees(theirs["angular_velocity"])
-    given = ", ".join(f"{x}f" for name in names for x in theirs[name].astype(float))
-    for name, text in STUBS[target].items():
-        (stubs / name).parent.mkdir(parents=True, exist_ok=True)
-        (stubs / name).write_text(text.replace("$all", given))
-    strict = ["-O1", "-Wall", "-Wextra", "-Werror", f"-I{stubs}", f"-I{folder}"]
-    subprocess.run(["gcc", "-c", *strict, folder / "policy.c", "-o", tmp_path / "policy.o"], check=True)
-    main, compiler = ("main.cpp", "g++") if target == "px4" else ("main.c", "gcc")
-    program = [compiler, *strict, stubs / main, tmp_path / "policy.o", "-lm", "-o", tmp_path / "fly"]
-    subprocess.run(program, check=True)
-    found = [float(x) for x in subprocess.run([tmp_path / "fly"], check=True, capture_output=True).stdout.split()]
-    thrust, rates = bundle(STATE)
-    expected = frame.to({"body_rate": rates})["body_rate"]
-    drone, weight = bundle.contract["drone"], bundle.contract["output"]["thrust"]["weight"]
-    full = weight / 0.5 if target == "px4" else 4 * np.polyval(drone["thrust_map"], drone["rotor_speed_max"])
-    command = frame.thrust(thrust, full)
-    if target == "crazyflie":
-        expected = expected * (1, -1, -1)  # cflib turns both signs
+def assert_commands_what_the_bundle_does(target, folder, bundle):
+    """In the first step of a flight from each of STATES, compiled with all warnings."""
+    name, stubs = next(x.name for x in folder.glob("policy_*.c*")), folder.with_suffix(".stubs")
+    before, after = STUBS[target].split("@")
+    observe = OBSERVE if "Write this function" in (folder / "pilot.h").read_text() else ""
+    code = (
+        "static float x[99], said[20]; static int count;",
+        before,
+        (folder / name).read_text(),
+        observe,
+        after,
+        MAIN,
+    )
+    for header in set(re.findall(r'#include ["<](.+[.]h)', code[2])) - {"math.h", "pilot.h"}:
+        (stubs / header).parent.mkdir(parents=True, exist_ok=True)
+        (stubs / header).touch()
+    (stubs / name).write_text("\n".join(code))
+    command = [{"px4": "g++"}.get(target, "gcc"), *FLAGS.split(), f"-I{stubs}", f"-I{folder}"]
+    subprocess.run(["gcc", "-c", *command[1:], folder / "policy.c", "-o", stubs / "policy.o"], check=True)
+    subprocess.run([*command, stubs / name, stubs / "policy.o", "-lm", "-o", stubs / "fly"], check=True)
+    for state in STATES:
+        bundle.reset()
+        command = np.concatenate([np.atleast_1d(x) for x in bundle(resting(**state, **RATE))])
+        theirs = FRAMES[target].to(state | RATE)
+        if target == "crazyflie":
+            theirs["quaternion"] = np.roll(theirs["quaternion"], 1)  # its log has qw first
+            theirs["angular_velocity"] = np.degrees(theirs["angular_velocity"])
+        given = np.concatenate([*(theirs[name] for name in NAMES), bundle.observation]).astype(str)
+        found = subprocess.run([stubs / "fly", *given], check=True, capture_output=True).stdout.split()
+        expected = np.concatenate(wanted(target, bundle.contract, command, state), None)
+        np.testing.assert_allclose(np.array(found, float), expected, rtol=2e-5, atol=2e-5 * np.nanmax(abs(expected)))
+
+
+def wanted(target, contract, command, state):
+    """What a firmware is told to follow a command of the bundle: all numbers of its setpoint."""
+    control, drone, frame = contract["output"]["control"], Drone(contract["drone"]), FRAMES[target]
+    rates, none, unset = frame.to({"body_rate": command[1:]})["body_rate"], np.zeros(3), np.full(3, np.nan)
     if target == "betaflight":
-        nominal, stick = Drone(bundle.contract["drone"]), autopilots.stick_rate(bundle.contract)
-        idle = autopilots.idle(nominal)
+        idle, stick = autopilots.idle(drone), 1500 + 500 * rates / autopilots.stick_rate(contract)
         throttle = frames.betaflight(min_check=autopilots.MIN_CHECK, motor_idle=idle)
-        command = throttle.thrust(thrust, *autopilots.throttle(nominal, idle)[:2])
-        expected = 1500 + 500 * expected / stick
-        expected, command = [*expected[:2], command], expected[2]
-    np.testing.assert_allclose(found, [*expected, command], rtol=2e-5, atol=2e-5 * np.abs(found).max())
+        return stick[:2], throttle.thrust(command[0], *autopilots.throttle(drone, idle)[:2]), stick[2]
+    if target == "crazyflie":
+        thrust, turn = frame.thrust(command[0], 4 * drone.thrust_limits[1]), np.degrees(command[1:]) * (1, -1, 1)
+        return {
+            "rates": (none, turn, none, thrust, none, [2, 2, 2]),
+            "attitude": (turn[:2], none, turn[2], none, thrust, none, [1, 1, 2]),
+            "velocity": (none, 0, 0, turn[2], command[:3], 0, [2, 2, 2, 0, 0, 2]),
+        }[control]
+    thrust = 0, 0, frame.thrust(command[0], drone.weight / 0.5)
+    heading = Rotation.from_quat(state["quaternion"], scalar_first=True).as_euler("ZYX")[0]
+    turned = Rotation.from_euler("ZYX", [heading, command[2], command[1]]).as_quat(scalar_first=True)
+    turned, velocity = frame.to({"quaternion": turned})["quaternion"], frame.to({"velocity": command[:3]})["velocity"]
+    return {
+        "rates": (rates, thrust),
+        "attitude": (turned * np.sign(turned[0]), -command[3], thrust),
+        "velocity": (unset, velocity, unset, none, np.nan, -command[3]),
+    }[control]
+
+
+def test_the_recipe_writes_code_for_a_firmware_that_commands_what_the_bundle_does(train, launch, trace_once, tmp_path):
+    trace_once("hovering")
+    train("bptt", tmp_path, "env.max_episode_steps=48")
+    printed = launch("export", f"checkpoint={tmp_path}/checkpoint.pt", "target=betaflight", "episodes=8")
+    assert printed.startswith(f"{tmp_path}/policy_betaflight: for the firmware of betaflight\n")
+    bundle = load_bundle(tmp_path / "policy")
+    assert_commands_what_the_bundle_does("betaflight", tmp_path / "policy_betaflight", bundle)
+
+
+@pytest.mark.parametrize("target", ["crazyflie", "px4"])
+@pytest.mark.parametrize("task", ["hovering", "landing", "racing"], ids=["rates", "attitude", "velocity"])
+def test_code_for_a_firmware_commands_in_each_mode_what_the_bundle_does(task, target, export_once, tmp_path):
+    (tmp_path / "policy").symlink_to(export_once(task)[2])
+    folder = write_target(tmp_path / "policy", target)
+    assert_commands_what_the_bundle_does(target, folder, load_bundle(tmp_path / "policy"))
+
+
+@cases(
+    (
+        "landing",
+        "betaflight",
+        "commands rates from what a drone measures; this policy commands attitude. Train it with env.c",
+    ),
+    (
+        "hovering, with memory",
+        "px4",
+        "rates or attitude or velocity .* commands rotor_thrusts. Train it with env.control=rates,",
+    ),
+    ("tracking", "crazyflie", "Train it with env.observe_last_action=false, or call policy.c from code of your own"),
+    ("hovering", "ardupilot", "target must be one of crazyflie, px4, betaflight, got 'ardupilot'"),
+)
+def test_a_policy_that_a_firmware_cannot_follow_is_refused_with_what_to_train(task, target, said, export_once):
+    refuses(said, write_target, export_once(task)[2], target)

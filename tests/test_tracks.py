@@ -40,6 +40,9 @@ def test_a_gate_is_passed_in_its_direction_and_within_its_opening_only():
         assert ends["reward_terms", "gate"].flatten().sign().tolist() == pays
     _, ends = one_step({"gates": BOTH_WAYS[::-1], **OPEN}, position, velocity)  # the same place from the other side
     assert ends["state", "gate_passed"].flatten().tolist() == [sign < 0 for sign, _ in ways.values()]
+    windows = [{"position": [0, y, 3], "yaw": 0.0} for y in (0, 4)]  # in one wall, where one is passed the other is not
+    _, ends = one_step({"gates": windows, **OPEN}, position[:1], velocity[:1])
+    assert ends["reward_terms", "gate"].flatten().tolist() == [5.0]
 
 
 def test_the_reward_of_a_gate_with_a_direction_is_how_fast_the_way_around_into_it_gets_shorter():

@@ -32,6 +32,7 @@ __all__ = [
     "HybridLoss",
     "LandingEnv",
     "ObservationNormalizer",
+    "PODSLoss",
     "QuadrotorEnv",
     "QuadrotorParams",
     "RacingEnv",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, cast
 
@@ -57,7 +57,10 @@ class TermAudit:
 
 
 class RewardAudit(dict[str, TermAudit]):
-    """The audit of each reward term by name, which shows as a table."""
+    """The audit of each reward term by name, which shows as a table, with the traps below it."""
+
+    traps: Sequence[str] = ()  #: what will keep a policy from learning the task, each a sentence with its remedy
+    unseen: Sequence[str] = ()  #: ends that this rollout lacks, "success" or "crash", whose traps stay hidden
 
     @property
     def without_gradient(self) -> list[str]:
@@ -79,7 +82,9 @@ class RewardAudit(dict[str, TermAudit]):
             )
         share = sum(self[name].return_share for name in lost)
         partially = f"partially differentiable: all but {', '.join(lost)}, {share:.1%} of the return"
-        return "\n".join([*lines, partially if lost else "fully differentiable"])
+        lines += [partially if lost else "fully differentiable", *(f"trap: {trap}" for trap in self.traps)]
+        lines += [f"not seen, start some drones close to it: {end}" for end in self.unseen]
+        return "\n".join(lines)
 
 
 @checked
@@ -94,10 +99,13 @@ def audit_reward(
     done_key: Entry = ("next", "done"),
     tolerance: NonNegative = 1e-4,
 ) -> RewardAudit:
-    """Find out which terms of a reward have a gradient, and how much each adds to the return and to its gradient.
+    """Find out which terms of a reward have a gradient, how much each adds to the return, and what traps there are.
 
     A verdict holds for this rollout alone, of any differentiable environment. Start it where all terms are paid, and
-    make it longer than the delay between an action and its effect.
+    make it longer than the delay between an action and its effect. Its ``traps`` mislead a policy: waiting pays
+    more than an arrival after which the target jumps; dying is cheap where steps pay less than nothing; loitering pays
+    more than a success that ends the episode; a term is flat in most flights, or too small to matter. To go on counts
+    as 1 / (1 - gamma) steps, for a gamma of 1 as the horizon.
 
     Args:
         rollout: (*, horizon) with its graph, as ``differentiable_rollout`` returns it.
@@ -154,14 +162,90 @@ def audit_reward(
     discount = discounts(done, torch.as_tensor(gamma, dtype=reward.dtype, device=reward.device))
     returns = {name: (discount * term).sum((-2, -1)) for name, term in terms.items()}
     sizes = {name: x.detach().abs().mean().item() for name, x in returns.items()}
-    norms = {name: _gradient(x.mean(), sources).norm().item() for name, x in returns.items()}
+    steps = _steps(rollout.get("action", None))
+    grads = {name: _gradients(x.mean(), [*sources, *steps]) for name, x in returns.items()}
+    norms = {name: _vector(x, sources).norm().item() for name, x in grads.items()}
     all_sizes, all_norms = (sum(x.values()) or 1.0 for x in (sizes, norms))
     audit = RewardAudit()
     for name, term in terms.items():
         shares = sizes[name] / all_sizes, norms[name] / all_norms
         verdict = _verdict(term, norms[name])
         audit[name] = TermAudit(returns[name].mean().item(), shares[0], norms[name], shares[1], verdict)
+    beside = () if isinstance(done_key, str) else done_key[:-1]
+    said = [name for name in ("success", "crash", "terminated") if (*beside, name) in rollout]
+    ends = {name: leaf(rollout, (*beside, name)) for name in said}
+    audit.unseen = [name for name in said if name != "terminated" and not ends[name].any()]
+    traps = [*_jumping(reward.detach(), done, rollout.get((*beside, "state"), None))]
+    traps += _ending(reward.detach(), ends, shape[-2] if gamma == 1.0 else 1.0 / (1.0 - gamma))
+    for name, x in audit.items():
+        if x.verdict == "differentiable":
+            traps += _flat(name, terms[name], returns[name], grads[name][len(sources) :])
+            if max(x.return_share, x.gradient_share) < 1e-3:
+                traps.append(f"{name!r} is less than a thousandth of return and gradient: it teaches nothing")
+    audit.traps = traps
     return audit
+
+
+def _jumping(reward: Tensor, done: Tensor, state: Any) -> Iterator[str]:
+    """A target that jumps, which is an entry of the state that changes in one step and not in those beside it."""
+    reward, done = (x.reshape(-1, x.shape[-2]) for x in (reward, done))
+    jumps, names, falls, usual = set(), [], [], 0.25 * (reward.quantile(0.9) - reward.quantile(0.1))
+    for name, x in () if state is None else state.flatten_keys("/").items():
+        if x.dtype == torch.bool or name.startswith("drone/") or x.shape[: state.ndim] != state.shape:
+            continue
+        change = x.detach().to(reward).reshape(*reward.shape, -1).diff(dim=1).norm(dim=-1)
+        alone = change[:, 1:-1] > 10.0 * torch.maximum(change[:, :-2], change[:, 2:]) + 1e-6
+        alone &= ~(done[:, :-3] | done[:, 1:-2] | done[:, 2:-1])
+        if alone.any():
+            names, jumps = [*names, name], jumps | {(i, t + 2) for i, t in alone.nonzero().tolist()}
+    for i, t in jumps:
+        ends = [k for k in range(t + 1, reward.shape[1]) if done[i, k - 1] or (i, k) in jumps]
+        before, after = reward[i, t - 1], reward[i, t : min(ends, default=None)]
+        fell = before - reward[i, t + 1]
+        if fell > usual + 5.0 * (before - reward[i, t - 2]).abs() and (after - before).sum() < 0.0:
+            falls.append((before.item(), reward[i, t + 1].item()))
+    if len(falls) > 0.5 * len(jumps):
+        before, after = (sum(x) / len(falls) for x in zip(*falls, strict=True))
+        yield (
+            f"{', '.join(names)} jumped {len(jumps)} times, and a step then paid {after:.3g} instead of {before:.3g}: "
+            "waiting before an arrival pays more than arriving. Reward the velocity towards the target, or the arrival"
+        )
+
+
+def _ending(reward: Tensor, ends: Mapping[str, Tensor], steps: float) -> Iterator[str]:
+    """Ends of episodes that pay more than going on, and successes that pay less."""
+    never = torch.zeros_like(reward, dtype=torch.bool)
+    terminated, success = (ends.get(name, never) for name in ("terminated", "success"))
+    died, won = terminated & ~success, terminated & success
+    usual = reward[~terminated].mean().item()
+    cost = reward[died].mean().item() if died.any() else 0.0
+    if ("crash" in ends or died.any()) and usual < 0.0 and cost > steps * usual:
+        seen = f"costs {-cost:.3g}" if died.any() else "was not seen"
+        yield (
+            f"a step pays {usual:.3g} on average, {steps * usual:.3g} in {steps:.0f} steps, and a crash {seen}: dying "
+            "is cheap. Add a constant, so that a good step pays more than nothing, or let a crash cost more"
+        )
+    before, ended = reward[..., :-1, :][won[..., 1:, :]], reward[..., 1:, :][won[..., 1:, :]]
+    if len(before) and (loitering := steps * before.mean().item()) > ended.mean().item():
+        yield (
+            f"success ends an episode and pays {ended.mean().item():.3g}, while going on as in the step before it pays "
+            f"{loitering:.3g} in {steps:.0f} steps: loitering pays more. Let success pay more, or the episode go on"
+        )
+
+
+def _flat(name: str, term: Tensor, returns: Tensor, grads: Sequence[Tensor | None]) -> Iterator[str]:
+    """A term that has no gradient in the actions of most flights: of those that it pays least."""
+    squares = [g.square().sum(-1) for g in grads if g is not None]  # of each step, or of all steps first
+    size = total(x.sum(0) if x.dim() > returns.dim() else x for x in squares) if squares else returns.new_zeros(())
+    if size.shape != returns.shape:
+        return
+    flat = size < 1e-6 * size.max()
+    paid = (term[~flat] != 0).float().mean() > 0.5  # in each step: a bonus for an event is another matter
+    if paid and 2 * flat.sum() >= flat.numel() and returns[flat].mean() < returns[~flat].mean():
+        yield (
+            f"{name!r} is flat in {flat.float().mean():.0%} of the flights, those in which it pays least: it leads "
+            "nobody there. Reward a distance, or its logarithm, and nothing that saturates far from the goal"
+        )
 
 
 @dataclass(frozen=True, repr=False)
@@ -283,11 +367,22 @@ def _gradients(value: Tensor, sources: list[Tensor | GradientEdge]) -> Sequence[
 
 
 def _gradient(value: Tensor, sources: list[Tensor | GradientEdge]) -> Tensor:
-    """The gradient of a scalar as one vector, in double precision: squares of small numbers are not lost."""
-    pairs = zip(_gradients(value, sources), sources, strict=True)
+    """The gradient of a scalar as one vector; see :func:`_vector`."""
+    return _vector(_gradients(value, sources), sources)
+
+
+def _vector(grads: Sequence[Tensor | None], sources: list[Tensor | GradientEdge]) -> Tensor:
+    """The gradients in sources, which come first, as one vector in double precision, for the squares of small ones."""
+    pairs = zip(grads, sources, strict=False)
     grads = [torch.zeros_like(x) if g is None and isinstance(x, Tensor) else g for g, x in pairs]
     known = [g.flatten().double() for g in grads if g is not None]
-    return torch.cat(known) if known else value.new_zeros(1, dtype=torch.float64)
+    return torch.cat(known) if known else torch.zeros(1, dtype=torch.float64)
+
+
+def _steps(action: Any) -> list[Tensor | GradientEdge]:
+    """The actions of a rollout as sources, of each step or all at once; none where they have no graph."""
+    steps = sources_of_steps(action) if isinstance(action, Tensor) else None
+    return [] if steps is None else [steps] if isinstance(steps, Tensor) else [*steps]
 
 
 def _verdict(term: Tensor, gradient_norm: float) -> str:

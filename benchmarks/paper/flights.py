@@ -26,7 +26,8 @@ from torchrl_quad.training.building import build_env
 from torchrl_quad.training.configuration import CONFIG
 from torchrl_quad.training.evaluation import drawing_from, evaluate, load_policy
 
-METHODS = {name: name.upper() for name in ("bptt", "shac", "abpt", "sapo", "ahac")} | {"hybrid": "Hybrid", "ppo": "PPO"}
+METHODS = {name: name.upper() for name in ("bptt", "shac", "abpt", "sapo", "ahac")}
+METHODS |= {"hybrid": "Hybrid", "ppo": "PPO", "train": "One setting"}  # the last, train.py, has no tuned files
 TASKS = {  # what is shown of each with the solved episodes: column, factor, digits, unit
     "hovering": ("position_error", 100, 1, "cm"),
     "tracking": ("tracking_rmse", 100, 1, "cm"),
@@ -149,8 +150,8 @@ def drones(args: Namespace) -> None:
 
 
 def scaled(task: str, method: str, factor: str) -> list[str]:
-    """Multiply the learning rates of the policy, from first to last; the hybrid has a bound on its KL instead."""
-    names = ["actor.max_kl"] if method == "hybrid" else ["actor.lr", "actor.final_lr"]
+    """Multiply the learning rates of the policy, from first to last, or the bound on its KL that sets them."""
+    names = ["actor.max_kl"] if method in ("hybrid", "train") else ["actor.lr", "actor.final_lr"]
     cfg = shipped_configuration(task, method)
     return [f"{name}={float(factor) * OmegaConf.select(cfg, name):g}" for name in names]
 

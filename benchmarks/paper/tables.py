@@ -241,11 +241,11 @@ def choice_table(rows: Sequence[Row], starts: Starts) -> Table:
 
 def speed_table(rows: Sequence[Row]) -> Table:
     """Show how many thousand steps a second each method took on each machine: medians over the seeds."""
-    lines = []
+    lines, flown = [], {row["algorithm"] for row in rows}
     for task, of in in_order(rows).items():
         for (name,), own in sorted(grouped([row for runs in of.values() for row in runs], "machine").items()):
             row = {"task": LABELS.get(task, task), "machine": name}
-            for method, label in flights.METHODS.items():
+            for method, label in ((x, label) for x, label in flights.METHODS.items() if x in flown):
                 speeds = [float(x["steps"]) / float(x["seconds"]) / 1e3 for x in own if x["algorithm"] == method]
                 row[label] = f"{np.median(speeds):.0f}" if speeds else ""
             lines.append(row)

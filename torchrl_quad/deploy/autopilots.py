@@ -69,6 +69,11 @@ def gains(drone: Drone, newtons: float | Array) -> Array:
     )
 
 
+def tilt_gains(contract: Contract) -> dict[str, float]:
+    """P of roll and pitch [1/s] of the loop around the rate loop, where actions command attitudes or velocities."""
+    return dict(zip(AXES, contract["output"]["gains"].get("tilt_gain", ()), strict=False))
+
+
 def idle(drone: Drone) -> float:
     """The signal of Betaflight's motors at the least rotor speed, as it counts it: in 0.01 %."""
     return round(1e4 * drone.rotor_speed_min / drone.rotor_speed_max) / 1e4
@@ -123,6 +128,7 @@ def px4(contract: Contract) -> str:
         for axis, row in zip(AXES, gains(drone, unit), strict=True)
         for name, value in zip("PIDK", (*row, 1.0), strict=True)
     }
+    values |= {f"MC_{axis.upper()}_P": gain for axis, gain in tilt_gains(contract).items()}
     values |= {"MC_YAW_TQ_CUTOFF": 0.0, "THR_MDL_FAC": curve.model_factor}
     values["MPC_THR_HOVER"] = drone.weight / curve.full_thrust
     lines = [f"1\t1\t{name}\t{value:.6g}\t9\n" for name, value in values.items()]
@@ -134,7 +140,9 @@ def crazyflie(contract: Contract) -> str:
     of it about roll and pitch."""
     drone = Drone(contract["drone"])
     found = gains(drone, drone.thrust_limits[1] / 65535.0 * np.array([0.5, 0.5, 1.0])) / frames.DEGREES
-    lines = [f"flightmode.stabMode{axis.capitalize()}=0\n" for axis in AXES]
+    tilts = tilt_gains(contract)
+    lines = [f"flightmode.stabMode{axis.capitalize()}={int(axis in tilts)}\n" for axis in AXES]
+    lines += [f"pid_attitude.{a}_kp={k:.4g}\npid_attitude.{a}_ki=0\npid_attitude.{a}_kd=0\n" for a, k in tilts.items()]
     for axis, row in zip(AXES, found, strict=True):
         lines += [f"pid_rate.{axis}_k{name}={value:.4g}\n" for name, value in zip("pid", row, strict=True)]
     return f"# Crazyflie {UNTRIED.format(contract['task']['name'])}\n" + "".join(lines)

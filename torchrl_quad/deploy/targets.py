@@ -24,6 +24,8 @@ TARGETS: dict[str, dict[str, str | None]] = {
     "px4": {"policy_px4.cpp": None},
     "betaflight": {"policy_betaflight.c": None},
 }
+# What each takes of what policies command.
+MODES = dict.fromkeys(("crazyflie", "px4"), ("rates", "attitude", "velocity")) | {"betaflight": ("rates",)}
 AIMED = ("hovering", "landing")  # tasks that observe a target and the body
 STACK = 2000  # of an app, in words, which holds the layers of networks up to 500 wide
 
@@ -32,7 +34,7 @@ def write_target(folder: str | Path, target: str) -> Path:
     """Write the folder ``policy_TARGET`` beside a bundle: the network in C, and the code that calls it in a firmware.
 
     Args:
-        folder: a bundle whose policy commands rates and reads no image.
+        folder: a bundle whose policy reads no image, and commands what the target takes (``MODES``).
         target: crazyflie, px4 or betaflight.
 
     Raises:
@@ -43,13 +45,13 @@ def write_target(folder: str | Path, target: str) -> Path:
     contract, output = bundle.contract, bundle.contract["output"]
     if not isinstance(target, str) or target not in TARGETS:
         raise UserValueError(f"target must be one of {', '.join(TARGETS)}, got {shown(target)}.")
-    queue = "action_queue" in contract["graphs"]["observe"]["reads"]
-    wrong = {"an image": contract["camera"], "commands on their way": queue}
-    wrong = [what for what, has in wrong.items() if has]
-    if output["control"] != "rates" or wrong:
+    control, modes = output["control"], MODES[target]
+    wrong = {"env.control=rates": control not in modes, "env.camera=null": contract["camera"]}
+    wrong["env.observe_last_action=false"] = "action_queue" in contract["graphs"]["observe"]["reads"]
+    if wrong := [setting for setting, has in wrong.items() if has]:
         raise UserValueError(
-            f'target={target}: the code is for control="rates" from what a drone measures; this policy commands '
-            f"{output['control']}{' and reads ' + wrong[0] if wrong else ''}. Call policy.c from code of your own."
+            f"target={target}: the code commands {' or '.join(modes)} from what a drone measures; this policy commands "
+            f"{control}. Train it with {' '.join(wrong)}, or call policy.c from code of your own."
         )
     drone = Drone(contract["drone"])
     idle = autopilots.idle(drone)
@@ -57,6 +59,8 @@ def write_target(folder: str | Path, target: str) -> Path:
     aims = contract["task"]["name"] in AIMED and contract["observation"]["size"] == 13
     values = {
         "task": contract["task"]["name"],
+        "control": control,
+        "message": {"velocity": "trajectory"}.get(control, f"vehicle_{control}") + "_setpoint",
         "target": as_floats(bundle.starts()["target"][0]) if aims else "",
         "memory": " pilot->memory," if contract["memory"] else "",
         "full_thrust": as_float(len(drone.rotor_spin) * drone.thrust_limits[1]),
@@ -69,7 +73,8 @@ def write_target(folder: str | Path, target: str) -> Path:
         "stick": as_float(math.radians(autopilots.stick_rate(contract))),
         "stack": STACK,
     }
-    features = ["aims" if aims else "yours", *(["memory"] if contract["memory"] else [])]
+    features = ["aims" if aims else "yours", control, *["thrust"] * (control != "velocity")]
+    features += ["memory"] * bool(contract["memory"])
     place = folder.parent / f"{folder.name}_{target}"
     files = {"pilot.h": None, **TARGETS[target]}
     written = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -29,14 +29,18 @@ from torchrl_quad.options import Delay, Device, Horizon, Seed, Share, Size, chec
 
 
 class _Build(type(EnvBase)):
+    defaults: Mapping[str, Any]
+
     def __call__(cls, *args: Any, auto_reset: bool = False, **kwargs: Any) -> Any:
         if auto_reset:  # TorchRL would wrap it, and no episode would ever begin again
             raise UserValueError(
                 "auto_reset=True is for environments that reset themselves in the step that ends an episode, and this "
                 "one waits for a reset. Leave it out: rollouts and collectors reset where an episode ends."
             )
+        given = dict(zip(inspect.signature(cls).parameters, args, strict=False))
+        kwargs = {name: x for name, x in cls.defaults.items() if name not in given} | kwargs
         env = super().__call__(*args, **kwargs)
-        env._built_with = dict(zip(list(inspect.signature(cls).parameters), args, strict=False)) | kwargs
+        env._built_with = given | kwargs
         return env
 
 

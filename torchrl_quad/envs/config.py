@@ -166,14 +166,15 @@ def check_flown(dynamics: Dynamics, params: QuadrotorParams, which: str = "") ->
         raise UserValueError(f"{which}{error}") from None
 
 
-def full_signature(cls: type, base: type) -> inspect.Signature:
+def full_signature(cls: Any, base: type) -> inspect.Signature:
     """All arguments of a task: its own, then those it hands on to its base, then ``compile``, which TorchRL takes."""
     arguments: dict[str, inspect.Parameter] = {}
     for owner in cls.__mro__[: cls.__mro__.index(base)]:
         parameters = inspect.signature(vars(owner)["__init__"]).parameters if "__init__" in vars(owner) else {}
         for name, argument in parameters.items():
             if name != "self" and argument.kind not in (argument.VAR_KEYWORD, argument.VAR_POSITIONAL):
-                arguments.setdefault(name, argument)
+                usual = cls.defaults.get(name, argument.default)
+                arguments.setdefault(name, argument.replace(default=usual))
     option = inspect.Parameter("compile", inspect.Parameter.KEYWORD_ONLY, default=False, annotation="bool | dict")
     return inspect.Signature(sorted([*arguments.values(), option], key=lambda x: x.kind))
 

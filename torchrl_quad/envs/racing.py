@@ -325,9 +325,8 @@ class RacingEnv(QuadrotorEnv):
         parts = [centre - state["position"] for centre, _ in poses]
         if self.observe_directions:
             ahead = [forward(rotation) for _, rotation in poses]
-            left = [
-                (gap * along).sum(-1, keepdim=True).clamp(-1.0, 1.0) for gap, along in zip(parts, ahead, strict=True)
-            ]
+            ways = zip(parts, ahead, strict=True)
+            left = [(gap * along).sum(-1, keepdim=True).clamp(-1.0, 1.0) for gap, along in ways]
             parts += [10.0 * x for x in (*ahead, *left)]
         return torch.cat((*parts, *terms.body_observation(state)), -1)
 
@@ -351,7 +350,8 @@ class RacingEnv(QuadrotorEnv):
         before = FUNNEL * (off - ROUND) + beyond.clamp_min(0.0)
         growth = FUNNEL * (aside * velocity[:, 1:]).sum(-1, keepdim=True) / off + torch.where(beyond > 0.0, speed, 0.0)
         outside = _outside(aside, 0.5 * self.openings[state["gate"][:, 0]]).amax(-1, keepdim=True).clamp_min(0.0)
-        missed = torch.where((along >= 0.0) & (along < self.control_dt * speed), outside.tanh(), 0.0)
+        crossed = (along >= 0.0) & (along < self.control_dt * speed) & ~state["gate_passed"]  # when another was next
+        missed = torch.where(crossed, outside.tanh(), 0.0)
         return {**state, "position": place, "velocity": velocity, "target": pad(-before, (0, 2))}, growth, missed
 
     def reward_terms(self, state: State) -> State:

@@ -27,6 +27,11 @@ def norm(x: Tensor) -> Tensor:
     return vector_norm(x, dim=-1, keepdim=True)
 
 
+def shortened(x: Tensor, longest: float) -> Tensor:
+    """Vectors (*, k), those that are longer shortened to this length: the velocity of who hurries to x, and stops."""
+    return x * (longest / norm(x).clamp_min(longest))
+
+
 def distance(state: Mapping[str, Tensor]) -> Tensor:
     """Distance to the target, (*, 1) [m]."""
     return norm(state["position"] - state["target"])
@@ -51,6 +56,12 @@ def target_reward(state: Mapping[str, Tensor], weights: Mapping[str, float]) -> 
         "velocity": -weights["velocity"] * norm(state["velocity"]),
         "angular_velocity": -weights["angular_velocity"] * norm(state["angular_velocity"]),
     }
+
+
+def penalties(weights: Mapping[str, float], **errors: Tensor) -> dict[str, Tensor]:
+    """The terms of "make these errors (*, k) small", each (*, 1): ``survival``, and minus the length of each error."""
+    survival = torch.full_like(next(iter(errors.values()))[..., :1], weights["survival"])
+    return {"survival": survival, **{name: -weights[name] * norm(x) for name, x in errors.items()}}
 
 
 def outside(position: Tensor, centre: Tensor, half_width: Tensor | float, height: float, floor: float = 0.0) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchrl_quad.dynamics import presets, quaternion
-from torchrl_quad.envs.track_files import own_format
+from torchrl_quad.envs.track_files import own_format, posed
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.options import Seed, accepted, between, build, check_value, checked, entries
 from torchrl_quad.rotations import from_euler
@@ -201,12 +201,12 @@ def load_track(track: str | Path | Mapping = "visfly", **settings: Any) -> dict[
     if "random" in values:
         course = _course(source, values["random"] or {}, found, floor)
         found |= {**shape, "random": asdict(course)}
-        zeros = course.draw(1, lambda *size: torch.zeros(size, dtype=torch.float64))
-        raw = zeros[0][0].tolist() if "gate_radius" in found else _gates(*zeros)
-    directed = None
+        raw = _drawn(course, lambda *size: torch.zeros(size, dtype=torch.float64), found)
+    directed = turned = None
     if any(isinstance(gate, Mapping) for gate in _rows(raw)):
         directed = _directed(source, _rows(raw), shape, "gate_radius" in found)
-        raw = [gate["position"] for gate in directed]
+        raw, turned = ([gate[key] for gate in directed] for key in ("position", "rotation"))
+        turned = torch.tensor(turned, dtype=torch.float64)
     elif extra := [key for key in (*shape, "frame", "rotation_jitter") if key in {**shape, **found}]:
         raise UserValueError(
             f"{source}: {extra[0]} is of gates with a direction; these are points, with a gate_radius."
@@ -214,10 +214,8 @@ def load_track(track: str | Path | Mapping = "visfly", **settings: Any) -> dict[
     gates = _points(source, "gates", raw, floor)
     if not 2 <= len(gates) <= MAX_GATES:
         raise UserValueError(f"{source}: a track has 2 to {MAX_GATES} gates, got {len(gates)}.")
-    turned = None
     if directed:
         found["gates"] = [{**gate, "position": point} for gate, point in zip(directed, gates, strict=True)]
-        turned = torch.tensor([gate["rotation"] for gate in directed], dtype=torch.float64)
     else:
         found |= {"gates": gates, "gate_radius": float(found.get("gate_radius", 0.3))}
     usual = starts_before(torch.tensor(gates, dtype=torch.float64), turned, floor).tolist()
@@ -255,8 +253,7 @@ def random_track(seed: int, **settings: Any) -> dict[str, Any]:
     def uniform(*shape: int) -> Tensor:
         return 2.0 * torch.rand(shape, generator=generator, dtype=torch.float64) - 1.0
 
-    drawn = Course(**track.pop("random")).draw(1, uniform)
-    gates = drawn[0][0].tolist() if "gate_radius" in track else _gates(*drawn)
+    gates = _drawn(Course(**track.pop("random")), uniform, track)
     return load_track({key: x for key, x in track.items() if key != "starts"} | {"gates": gates})
 
 
@@ -324,10 +321,10 @@ def _rows(gates: Any) -> Sequence[Any]:
     return gates if isinstance(gates, Sequence) and not isinstance(gates, str) else ()
 
 
-def _gates(centres: Tensor, rotations: Tensor) -> list[dict[str, Any]]:
-    """The first of the courses drawn."""
-    poses = zip(centres[0].tolist(), rotations[0].tolist(), strict=True)
-    return [{"position": position, "rotation": rotation} for position, rotation in poses]
+def _drawn(course: Course, uniform: Callable[..., Tensor], track: Mapping[str, Any]) -> list[Any]:
+    """The gates of a course as a track lists them, as points where it has a ``gate_radius``."""
+    centres, rotations = course.draw(1, uniform)
+    return centres[0].tolist() if "gate_radius" in track else posed(centres[0], rotations[0])
 
 
 def _points(source: str, name: str, value: Any, floor: float) -> Any:

@@ -91,8 +91,8 @@ def agile_flight(source: str, values: dict[str, Any], gates: list[Mapping[str, A
         floor["floor"] = float(centres[:, 2].min()) - BELOW
         notes.append(f"gates are below z = 0: the floor is {BELOW:g} m below the lowest")
     own = {key: x for key, x in values.items() if key not in ("start_pos", "goal_pos", "render_offset", "axis")}
-    listed = [{"position": p, "rotation": q} for p, q in zip(centres.tolist(), turned.tolist(), strict=True)]
-    return {**floor, "closed": bool(is_lap), "start": start.tolist(), **own, "gates": listed, "notes": notes}
+    found = {**floor, "closed": bool(is_lap), "start": start.tolist(), **own}
+    return {**found, "gates": posed(centres, turned), "notes": notes}
 
 
 def time_optimal(source: str, values: dict[str, Any]) -> dict[str, Any]:
@@ -142,8 +142,7 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
     drawn = {name: _spread(source, x) for name, x in values["env"].get("randomizations", {}).items()}
     middle, spread = drawn.get("gate_pos", (np.zeros(3), None))
     centres, rotations = centres + middle, from_euler(as_array([gate["rpy"] for gate in track["gates"]]))
-    listed = zip(centres.tolist(), rotations.tolist(), strict=True)
-    own["gates"] = [{"position": position, "rotation": rotation} for position, rotation in listed]
+    own["gates"] = posed(centres, rotations)
     before = (centres - LSY_RUN_UP * rotate(rotations, [1.0, 0.0, 0.0])).tolist()
     own |= {"position_jitter": spread.tolist()} if spread is not None else {}
     own |= {"rotation_jitter": drawn["gate_rpy"][1].tolist()} if "gate_rpy" in drawn else {}
@@ -165,6 +164,11 @@ def isaac_drone_racer(source: str, values: dict[str, Any], gates: list[Mapping[s
     own = {key: x for key, x in values.items() if key not in ("lift", "gates") and not isinstance(x, Mapping)}
     listed = [{"position": [*gate["pos"][:2], gate["pos"][2] + values["lift"]], "yaw": gate["yaw"]} for gate in gates]
     return {**own, "gates": listed, "notes": ["gates are flown along their x axis, and round after round"]}
+
+
+def posed(centres: Any, rotations: Any) -> list[dict[str, Any]]:
+    """Gates as a track lists them, of centres (k, 3) [m] and rotations (k, 4)."""
+    return [{"position": p, "rotation": q} for p, q in zip(centres.tolist(), rotations.tolist(), strict=True)]
 
 
 def _in_order(gates: Mapping[str, Mapping]) -> list[Mapping[str, Any]]:

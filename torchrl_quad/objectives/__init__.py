@@ -6,6 +6,7 @@ from torchrl_quad.objectives.bptt import BPTTLoss
 from torchrl_quad.objectives.critic import PathwiseCriticLoss
 from torchrl_quad.objectives.hybrid import HybridLoss
 from torchrl_quad.objectives.pathwise import PathwiseLoss
+from torchrl_quad.objectives.pods import PODSLoss
 from torchrl_quad.objectives.sapo import SAPOLoss
 from torchrl_quad.objectives.shac import SHACLoss
 from torchrl_quad.objectives.trust_region import TrustRegion
@@ -15,6 +16,7 @@ __all__ = [
     "AHACLoss",
     "BPTTLoss",
     "HybridLoss",
+    "PODSLoss",
     "PathwiseCriticLoss",
     "PathwiseLoss",
     "SAPOLoss",

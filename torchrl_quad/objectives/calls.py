@@ -147,8 +147,7 @@ def action_gradient(objective: Tensor, action: Tensor) -> Tensor:
 
     ``action`` is ``rollout["action"]`` (*, horizon, k) as it was flown, no copy or part, with its graph, which is kept.
     """
-    node: Any = action.grad_fn
-    steps = sources_of_steps(action)
+    steps, node = sources_of_steps(action), cast(Any, action.grad_fn)
     if isinstance(steps, Tensor):
         node.learns = False  # the weights of a policy inside the compiled horizon get no gradient here
         try:
@@ -156,13 +155,19 @@ def action_gradient(objective: Tensor, action: Tensor) -> Tensor:
         finally:
             node.learns = True
         return grad.movedim(0, -2)
-    dim = None if steps is None else node._saved_dim  # of the stack; -2 is kept without its sign
+    return eager_gradient(objective, action)
+
+
+def eager_gradient(objective: Tensor, action: Tensor, *, create_graph: bool = False) -> Tensor:
+    """As :func:`action_gradient`, of an eager flight; ``create_graph`` lets it be differentiated again."""
+    steps, node = sources_of_steps(action), cast(Any, action.grad_fn)
+    dim = None if steps is None or isinstance(steps, Tensor) else node._saved_dim  # of the stack; -2 without its sign
     if steps is None or len(steps) != action.shape[-2] or dim not in (action.ndim - 2, 2**64 - 2):
         raise UserValueError(
             "The gradient of each action needs one rollout as differentiable_rollout returned it, whole and with its "
             "graph; this one was copied, reshaped or cut. Give the rollout itself to the loss."
         )
-    grads = torch.autograd.grad(objective, steps, retain_graph=True, allow_unused=True)
+    grads = torch.autograd.grad(objective, steps, retain_graph=True, create_graph=create_graph, allow_unused=True)
     return torch.stack([torch.zeros_like(action[..., 0, :]) if g is None else g for g in grads], -2)
 
 

@@ -21,11 +21,12 @@ from torchrl_quad import ObservationNormalizer, QuadrotorEnv, TrustRegion, make_
 from torchrl_quad.data.unwrap import base_env, leaf, observed
 from torchrl_quad.envs.registry import imported
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.objectives import PathwiseLoss
+from torchrl_quad.objectives import PathwiseLoss, SHACLoss
 from torchrl_quad.options import argument_names
 from torchrl_quad.training.configuration import own_disturbances, plain
 
 SEEDS_PER_PROCESS = 10_000
+SMOOTHING = 0.05  # how much of the scale of returns is new in each iteration
 _Loss = TypeVar("_Loss", bound=PathwiseLoss)
 
 
@@ -51,6 +52,14 @@ def cat_all(x: Tensor) -> Tensor:
 def mean_of_all(x: Tensor) -> Tensor:
     """The mean of a scalar over the processes."""
     return cat_all(x.detach().view(1)).mean()
+
+
+def of_first(x: float) -> float:
+    """The number that the first of the processes has."""
+    values = [x]
+    if world_size() > 1:
+        dist.broadcast_object_list(values)
+    return values[0]
 
 
 def own_seed(cfg: DictConfig) -> int:
@@ -183,6 +192,8 @@ class AdaptiveOptimizer(Optimizer):
     that stays below 2/3 of it multiplies it. The rate keeps between 1e-6 and 20 times the first one.
     """
 
+    most = 20.0
+
     def __init__(self, cfg: DictConfig, name: str, module: nn.Module) -> None:
         super().__init__(cfg, name, module)
         if cfg[name].max_kl is None:
@@ -199,7 +210,59 @@ class AdaptiveOptimizer(Optimizer):
             if moved > self.limit:
                 group["lr"] = max(group["lr"] / 1.5, 1e-6)
             elif moved < self.limit / 2.25:
-                group["lr"] = min(group["lr"] * 1.5, 20.0 * self.first_lr)
+                group["lr"] = min(group["lr"] * 1.5, self.most * self.first_lr)
+
+
+class PatientOptimizer(AdaptiveOptimizer):
+    """The same for a run of any length: its limit is ``max_kl`` times the patience that is left; ``lr`` is the most."""
+
+    most = 1.0
+
+    def anneal(self, iteration: float) -> None:
+        """Nothing: the recipe calls ``limit_to``."""
+
+    def limit_to(self, patience: float) -> float:
+        """Set the limit of an iteration, by the share of the patience that is left, and return it."""
+        self.limit = self.max_kl * max(patience, 0.02)
+        return self.limit
+
+
+class ReturnScale(nn.Module):
+    """The root mean square of a run's returns, by which rewards are divided, so that values are about 1 on every task.
+
+    As in PopArt (van Hasselt et al. 2016, arXiv:1602.07714) the last layer of the critics follows a change of the
+    scale, so that what they predict in the reward's own unit stays as it was.
+    """
+
+    def __init__(self, loss: SHACLoss) -> None:
+        super().__init__()
+        self.last = list(loss.value_network_params.values(True, True))[-2:]  # weight and bias
+        self.register_buffer("square", torch.zeros((), dtype=torch.float64, device=self.last[0].device))
+        self.register_buffer("count", torch.zeros_like(self.square))
+        self.square: Tensor
+        self.count: Tensor
+
+    @property
+    def value(self) -> Tensor:
+        """What rewards are divided by: 1 before the first update."""
+        return torch.where(self.count > 0, self.square.sqrt().clamp_min(1e-8), 1.0)
+
+    def divide(self, rollout: TensorDictBase) -> None:
+        """Divide the rewards of a rollout, which keep their graph."""
+        reward = leaf(rollout, ("next", "reward"))
+        rollout.set(("next", "reward"), reward / self.value.to(reward.dtype))
+
+    @torch.no_grad()
+    def update(self, data: TensorDictBase) -> None:
+        """Take the value targets of a divided rollout in, and write them in the new unit."""
+        before, target = self.value, leaf(data, "value_target")
+        self.count += 1
+        mean = mean_of_all(target.double().square().mean()) * before**2
+        self.square.lerp_(mean, torch.maximum(1 / self.count, torch.full_like(self.count, SMOOTHING)))
+        factor = before / self.value
+        for x in self.last:
+            x.data.mul_(factor)
+        data.set("value_target", target * factor.to(target.dtype))
 
 
 class TargetUpdate(SoftUpdate):

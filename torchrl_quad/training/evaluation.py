@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -57,6 +57,29 @@ def evaluate(
 def rounds(episodes: int | None, drones: int) -> int:
     """How often so many drones fly an episode each until there are ``episodes``; once for None."""
     return -(-(episodes or 1) // drones)
+
+
+def last_rise(rows: Sequence[Mapping[str, float]]) -> int:
+    """The step of a run's last evaluation that rose: by 1 % of the range of its returns, or of the episodes solved."""
+    rose, lowest, highest, solved = 0, math.inf, -math.inf, 0.0
+    for row in rows:
+        found = row["eval/return"]
+        lowest = min(lowest, found)
+        if found > highest + 0.01 * (highest - lowest if highest > lowest else 0.0):
+            rose, highest = int(row["steps"]), found
+        if row["eval/solved"] > solved + 0.01:
+            rose, solved = int(row["steps"]), row["eval/solved"]
+    return rose
+
+
+def patience_left(rows: Sequence[Mapping[str, float]], patience: float | None, least: int = 10) -> float:
+    """What is left of the patience with a run: 1 if the last evaluation rose, 0 if none has for a share ``patience``.
+
+    It is 1 for a run of fewer than ``least`` evaluations, and where ``patience`` is None.
+    """
+    if patience is None or len(rows) < least:
+        return 1.0
+    return max(1.0 - (1.0 - last_rise(rows) / rows[-1]["steps"]) / patience, 0.0)
 
 
 @contextlib.contextmanager

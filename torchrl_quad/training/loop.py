@@ -42,6 +42,7 @@ from torchrl_quad.training.building import (
     average_policy,
     iterations,
     minibatches,
+    of_first,
     own_seed,
     rank,
     task_of,
@@ -53,6 +54,8 @@ from torchrl_quad.training.evaluation import (
     drawing_from,
     evaluate,
     final_evaluation,
+    last_rise,
+    patience_left,
     print_summary,
     rounds,
     title,
@@ -82,6 +85,7 @@ class Run:
     Attributes:
         carry: where the next horizon starts; the algorithm sets it in each iteration.
         horizon: control steps of this iteration's rollout, ``cfg.horizon`` unless the algorithm sets it.
+        patience: the share of ``eval.patience`` that is left; at 0 the run ends.
     """
 
     def __init__(
@@ -116,7 +120,8 @@ class Run:
         logger_state = self._load(Path(cfg.resume)) if cfg.resume else None
         if not cfg.resume:
             self.carry = env.reset()
-        self.is_over = self.steps >= self.total_steps and (self.folder / "summary.json").exists()
+        self.patience = patience_left(self.rows, cfg.eval.patience)
+        self.is_over = not self.goes_on and (self.folder / "summary.json").exists()
         if rank() == 0 and not self.is_over:
             for name in ("summary.json", "failure.pt"):  # of the run before it was made longer, or went on
                 (self.folder / name).unlink(missing_ok=True)
@@ -124,13 +129,18 @@ class Run:
             with replacing(self.folder / "config.yaml") as path:
                 OmegaConf.save(cfg, path, resolve=True)
 
+    @property
+    def goes_on(self) -> bool:
+        """Whether there are steps left, and a reason to fly them."""
+        return self.steps < self.total_steps and self.patience > 0
+
     def __iter__(self) -> Iterator[int]:
         if self.is_over:
             if rank() == 0:
                 print(f"Finished before: {self.folder}")
             return
         began = time.perf_counter()
-        if self.cfg.compile and self.steps < self.total_steps:
+        if self.cfg.compile and self.goes_on:
             if rank() == 0:
                 print("Compiling the control step: about 30 s, which the next run finds in a cache.", flush=True)
             self._warm_up()
@@ -141,7 +151,7 @@ class Run:
         bounds = {"total": self.total_steps, "initial": self.steps}
         bar = tqdm(**bounds, unit="step", unit_scale=True, desc=name, disable=rank() > 0)
         with logging_redirect_tqdm([torchrl_logger]), bar:  # TorchRL's lines go above the bar
-            while self.steps < self.total_steps:
+            while self.goes_on:
                 self.starts.append(self.carry["state", "position"].clone())
                 for optimizer in (x for x in self.stateful if isinstance(x, Optimizer)):
                     optimizer.anneal(self.steps / self.drones / self.cfg.horizon)
@@ -159,10 +169,14 @@ class Run:
                         metrics = self._evaluate()
                         solved = metrics["eval/solved"]
                         bar.set_postfix_str(f"return {metrics['eval/return']:.2f}, solved {solved:.0%}")
+                        self.patience = patience_left(self.rows, self.cfg.eval.patience)
+                    self.patience = of_first(self.patience)
                     self.recorded.clear()
                     self.starts.clear()
                     self._save(self.folder / "checkpoint.pt")
         if rank() == 0:
+            if self.patience == 0:
+                print(f"Stopped before total_steps: no evaluation has risen since step {last_rise(self.rows):,}.")
             self._finish()
             print(f"{time.perf_counter() - began:.0f} s in all, {self.seconds:.0f} s of them training.")
 

@@ -18,7 +18,7 @@ from omegaconf import DictConfig, MissingMandatoryValue, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
-from torchrl_quad import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss
+from torchrl_quad import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, PODSLoss, SAPOLoss, SHACLoss
 from torchrl_quad.envs import task_class
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.objectives import PathwiseLoss
@@ -107,6 +107,7 @@ SETTINGS: dict[str, tuple[Any, str]] = {
     "buffer.fraction": (Fraction | None, "The share of horizons that start in visited states; null for none."),
     "eval.interval": (Size, "Iterations between evaluations; for only the last one, write 10000000."),
     "eval.episodes": (Size | None, "Episodes of each evaluation, at least; null for one of each drone."),
+    "eval.patience": (Below1 | None, "The run ends when no evaluation has risen for this share of it; null: never."),
     "eval.seed": (_Seed, ""),
     "logger.backend": (Literal["wandb", "tensorboard", "csv"] | None, ""),
     "logger.project": (str, ""),
@@ -148,7 +149,9 @@ PPO: dict[str, tuple[Any, str]] = {
     "max_importance_ratio": (Positive | None, "The largest ratio of probabilities; null for any."),
 }
 LOSSES: dict[str, type | None] = {
-    **{"abpt": ABPTLoss, "ahac": AHACLoss, "bptt": BPTTLoss, "hybrid": HybridLoss, "sapo": SAPOLoss, "shac": SHACLoss},
+    **{"abpt": ABPTLoss, "ahac": AHACLoss, "bptt": BPTTLoss, "hybrid": HybridLoss},
+    **{"pods": PODSLoss, "sapo": SAPOLoss, "shac": SHACLoss},
+    "train": AHACLoss,
     "ppo": None,  # TorchRL's
 }
 # What a recipe builds its loss with itself.
@@ -157,7 +160,7 @@ SET_BY_LOOPS = {"horizon", "average", "reduction", "delay_value", "delay_qvalue"
 IDLE: list[tuple[str, Callable[[Any], bool], str]] = [
     ("actor.final_lr", lambda c: c["actor"]["schedule"] == "constant", "actor.schedule=constant"),
     ("critic.final_lr", lambda c: c["critic"]["schedule"] == "constant", "critic.schedule=constant"),
-    ("actor.schedule actor.final_lr", lambda c: c["algorithm"] == "hybrid", "actor.max_kl sets the rate"),
+    ("actor.schedule actor.final_lr", lambda c: c["algorithm"] in ("hybrid", "train"), "actor.max_kl sets the rate"),
     ("actor.input_scale critic.input_scale", lambda c: c["normalize"], "normalize=true"),
     ("actor.channels", lambda c: c["env"].get("camera") is None, "env.camera=null"),
     ("actor.vision", lambda c: c["env"].get("camera") is None and c["actor"]["vision"], "env.camera=null"),

@@ -78,8 +78,8 @@ def simulator_class(name: str) -> type[Simulator]:
 def make_simulator(
     name: str, contract: Contract, loop: str = "contract", motors: Sequence[int] = (0, 1, 2, 3)
 ) -> Simulator:
-    """Build a simulator by its name; ValueError where it is unknown, or lacks the rate loop, or the camera that the
-    policy of the contract needs, or where the bundle cannot judge, ImportError where it is not installed."""
+    """Build a simulator by its name; ValueError where it is unknown, or lacks the rate loop, or the camera or way to
+    the rotors that the policy needs, or where the bundle cannot judge, ImportError where it is not installed."""
     if why := contract["task"]["unjudged"]:
         raise UserValueError(
             f"The simulators here cannot fly this bundle of the task {contract['task']['name']!r}: {why}. Fly it in "
@@ -90,6 +90,8 @@ def make_simulator(
         raise UserValueError(f"{name} has no camera, and this policy reads images. Fly it in mujoco or torchrl_quad.")
     if loop not in kind.loops:
         raise UserValueError(f"{name} has no rate loop {shown(loop)}. Choose from: {', '.join(kind.loops)}.")
+    if contract["output"]["control"] == "rotor_thrusts" and loop not in LOOPS:
+        raise UserValueError(f"{name}, loop={loop}, mixes body rates; this policy commands rotors. Fly it in mujoco.")
     if cannot := special(contract["drone"] | contract["plant"]) & kind.lacks:
         raise UserValueError(
             f"{name} does not fly drones with {' and '.join(sorted(cannot))}. Fly this one in mujoco or torchrl_quad."

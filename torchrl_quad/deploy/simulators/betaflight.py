@@ -67,8 +67,6 @@ class Betaflight(MuJoCo):
         super().__init__(contract, "contract", motors)
         self.firmware = Firmware(contract, self.dt, loop == "stock")
         self.control.loop = self.firmware
-        if self.control.mode == "rotor_thrusts":
-            raise UserValueError("betaflight mixes body rates, and this policy commands rotors. Fly it in mujoco.")
         self.version = f"Betaflight {self.firmware.version}, {MuJoCo.version}"
 
     def reset(self, starts: Mapping[str, Array]) -> None:

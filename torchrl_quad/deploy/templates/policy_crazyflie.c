@@ -1,8 +1,12 @@
-/* An app of the Crazyflie: the policy of the task "$task" sends body rates and thrust. Generated. Untried on a drone.
+/* An app of the Crazyflie: the policy of the task "$task" commands $control. Generated. Untried on a drone.
  *
  * Make it with `make CRAZYFLIE_BASE=path/to/crazyflie-firmware` in this folder. Frames as in torchrl_quad.deploy.frames:
- * both have z up and x forward; pitch counts with the other sign; rates are in deg/s.
+ * both have z up and x forward; pitch counts with the other sign; angles are in degrees. The firmware turns a wanted yaw
+ * angle at the rate of yaw, and follows that angle.
+@velocity  * It reaches velocities by loops of its own (velCtlPid), with 20 degrees of tilt at most, and not by those of the training.
  */
+#include <math.h>
+
 #include "FreeRTOS.h"
 #include "app.h"
 #include "commander.h"
@@ -13,7 +17,7 @@
 #include "pilot.h"
 
 #define DEGREES 57.2957795f
-#define FULL_THRUST $full_thrust /* N, of four motors at 65535 */
+@thrust #define FULL_THRUST $full_thrust /* N, of four motors at 65535 */
 
 static uint8_t flies; /* the parameter policy.flies: 1 lets the policy fly, 0 lets go */
 
@@ -49,12 +53,15 @@ void appMain(void)
         read_logs("gyro", at, 3, 1.0f / DEGREES, rate);
         if (pilot_step(&pilot, position, quaternion, velocity, rate, command)) flies = 0;
         memset(&setpoint, 0, sizeof setpoint);
-        setpoint.mode.roll = setpoint.mode.pitch = setpoint.mode.yaw = modeVelocity;
-        setpoint.attitudeRate.roll = DEGREES * command[1];
-        setpoint.attitudeRate.pitch = -DEGREES * command[2];
+        setpoint.mode.yaw = modeVelocity;
         setpoint.attitudeRate.yaw = DEGREES * command[3];
-        setpoint.thrust = command[0] / FULL_THRUST * 65535.0f;
-        if (setpoint.thrust > 60000.0f) setpoint.thrust = 60000.0f;
+@rates         setpoint.mode.roll = setpoint.mode.pitch = modeVelocity;
+@rates         setpoint.attitudeRate.roll = DEGREES * command[1], setpoint.attitudeRate.pitch = -DEGREES * command[2];
+@attitude         setpoint.mode.roll = setpoint.mode.pitch = modeAbs;
+@attitude         setpoint.attitude.roll = DEGREES * command[1], setpoint.attitude.pitch = -DEGREES * command[2];
+@velocity         setpoint.mode.x = setpoint.mode.y = setpoint.mode.z = modeVelocity; /* in the world frame */
+@velocity         setpoint.velocity.x = command[0], setpoint.velocity.y = command[1], setpoint.velocity.z = command[2];
+@thrust         setpoint.thrust = fminf(command[0] / FULL_THRUST * 65535.0f, 60000.0f);
         commanderSetSetpoint(&setpoint, COMMANDER_PRIORITY_EXTRX);
     }
 }

@@ -66,13 +66,6 @@ def test_the_quick_rollout_is_that_of_torchrl_in_every_entry_and_gradient(task, 
     assert not quick["next", "metrics"].requires_grad
 
 
-def test_episodes_that_end_on_the_way_start_anew_from_different_states():
-    env = HoveringEnv(num_envs=8, max_episode_steps=5)
-    flight = env.rollout(25, make_actor(env), break_when_any_done=False)
-    assert (flight["state", "step"][:, ::5] == 0).all()
-    assert len(flight["state", "position"][:, ::5].flatten(0, 1).unique(dim=0)) == 40
-
-
 def test_a_policy_may_read_the_state_and_any_other_flies_in_torchrls_loop(env):
     actor, start = make_actor(env, in_keys=["observation", ("state", "rotor_speed")], input_scale=1e-4), env.reset()
     quick, _ = fly(env.rollout, env, actor, start, 5)

@@ -9,7 +9,8 @@ READY := $(VENV)/.ready
 train: $(READY)
 	$(BIN)/python recipes/abpt.py $(ARGS)
 
-# Lint, check types, and run all fast tests.
+# Lint, check types, and run all fast tests. Bytecode is kept, since tests start many programs that import the package.
+test: export PYTHONDONTWRITEBYTECODE =
 test: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .

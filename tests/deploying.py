@@ -16,7 +16,7 @@ from torchrl.envs import TransformedEnv
 
 from torchrl_quad import ObservationNormalizer, make_actor, make_env, make_visual_actor
 from torchrl_quad.deploy import export, export_policy
-from torchrl_quad.deploy.tracing import Rules, name_of
+from torchrl_quad.deploy.tracing import Rules, name_of, trace
 
 # torch.onnx builds its table of operators again in each call, which takes longer than most of a small export.
 ONNXRegistry.from_torchlib = staticmethod(functools.cache(ONNXRegistry.from_torchlib))  # called of an instance, too
@@ -126,7 +126,7 @@ def export_once(tmp_path_factory, worker_id):
 
 @pytest.fixture
 def trace_once(export_once, monkeypatch):
-    """Makes further exports of a task in a test take its rules from the bundle that all share."""
+    """Makes further exports of a class of tasks in a test take their rules from the bundle that all share."""
 
     def trace_once(task):
         env, _, folder = export_once(task)
@@ -136,8 +136,8 @@ def trace_once(export_once, monkeypatch):
         obstacles = [x for x in about["graphs"].get("judge", {"reads": {}})["reads"] if x.startswith("scene.")]
         obstacles = {name: tuple(name.split(".")) for name in obstacles}
         entries = {name: keys[name] for name in about["task"]["entries"]}
-        rules = Rules(graphs, entries, obstacles, about["task"]["unjudged"])
-        monkeypatch.setattr(export, "trace", lambda *_: rules)
+        rules, own = Rules(graphs, entries, obstacles, about["task"]["unjudged"]), type(getattr(env, "base_env", env))
+        monkeypatch.setattr(export, "trace", lambda env, *given: rules if type(env) is own else trace(env, *given))
 
     return trace_once
 

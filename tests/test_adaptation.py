@@ -118,9 +118,10 @@ def test_what_cannot_be_adapted_is_refused_by_name(hovering):
 
 
 def test_the_recipe_writes_a_policy_a_bundle_and_a_page_and_leaves_the_checkpoint_alone(
-    log, launch, no_pictures, tmp_path
+    log, launch, no_pictures, tmp_path, trace_once
 ):
-    launch("bptt", *SMALL, f"hydra.run.dir={tmp_path}", "task=hovering")
+    trace_once("hovering")
+    launch("bptt", *SMALL, f"hydra.run.dir={tmp_path}", "task=hovering", "env.max_episode_steps=48")
     checkpoint, columns = tmp_path / "checkpoint.pt", {"t": log.time}
     for quantity in ("position", "quaternion", "velocity", "angular_velocity", "motor_command"):
         columns |= dict(zip(OURS[quantity], getattr(log, quantity).T, strict=True))

@@ -13,7 +13,6 @@ import pytest
 import torch
 from refusals import cases
 
-from torchrl_quad.deploy import export
 from torchrl_quad.files import machine, read_rows
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
@@ -71,11 +70,9 @@ def test_a_benchmark_writes_a_table(name, arguments, rows, run, run_here, tmp_pa
     assert len(run(name, arguments, quicker)) == rows
 
 
-def test_the_benchmark_of_exported_policies_writes_a_table(run, monkeypatch):
-    rules, trace = [], export.trace  # which are the same with a normaliser
-
+def test_the_benchmark_of_exported_policies_writes_a_table(run, monkeypatch, trace_once):
     def shorter(module):
-        monkeypatch.setattr(export, "trace", lambda *given: (rules or rules.append(trace(*given)) or rules)[0])
+        trace_once("racing")
         monkeypatch.setattr(module, "make_env", functools.partial(module.make_env, max_episode_steps=40))
 
     rows = run("deployment", "--checkpoints racing --observations 20 --calls 2", shorter)

@@ -51,6 +51,8 @@ def test_every_command_of_a_block_runs(command, launch, request, monkeypatch, tm
     program, *words = as_a_script(command)
     if "logger.backend=wandb" not in words:
         request.getfixturevalue("no_pictures")
+    if "recipes/export.py" in words:
+        request.getfixturevalue("trace_once")("hovering")
     script = next((word for word in words if word.endswith(".py")), "")
     if program == "make":
         run("make", "--dry-run", *words)  # what it does has tests of its own, and `make test` runs this one

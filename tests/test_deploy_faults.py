@@ -320,8 +320,12 @@ def test_the_package_imports_its_parts_when_they_are_asked_for():
     python("import sys, torchrl_quad; assert 'torch' not in sys.modules")
 
 
-def test_the_recipe_exports_the_best_policy_with_results_and_a_page(train, launch, refused, tmp_path, export_once):
-    train("bptt", tmp_path, "normalize=true", "task=forest", "env.camera={width: 6, height: 5}", "env.density=0.02")
+def test_the_recipe_exports_the_best_policy_with_results_and_a_page(
+    train, launch, refused, tmp_path, export_once, trace_once
+):
+    trace_once("forest")
+    settings = ["env.camera={width: 6, height: 5}", "env.density=0.05", "env.max_episode_steps=48"]
+    train("bptt", tmp_path, "normalize=true", "task=forest", *settings)
     printed = launch("export", f"checkpoint={tmp_path}/checkpoint.pt")
     assert re.search(r"policy: flies forest; its actions differ by at most \d\.\de-0[6-9]", printed)
     about = load_bundle(tmp_path / "policy").contract

@@ -96,26 +96,6 @@ def test_steps_that_a_collector_masks_do_not_count(env64):
     torch.testing.assert_close(BPTTLoss(actor)(cut)["loss_actor"], BPTTLoss(actor)(rollout[:, :3])["loss_actor"])
 
 
-def test_a_reduction_of_none_is_the_mean_and_losses_are_shown_in_a_line(env):
-    actor, value = make_actor(env), make_value(env)
-    rollout, _ = differentiable_rollout(env, actor, None, 3)
-    assert torch.equal(
-        SHACLoss(actor, value, reduction=None)(rollout)["loss_actor"], SHACLoss(actor, value)(rollout)["loss_actor"]
-    )
-    each = SHACLoss(actor, value, reduction="none")
-    assert each.loss_value(rollout.detach())[0].shape == (4, 3) and each.loss_actor(rollout)[0].shape == (4,)
-    assert repr(each) == "SHACLoss(actor_network=TanhGaussianActor, value_network=Critic, reduction='none')"
-
-
-def test_a_critic_may_see_more_than_the_actor():
-    env = HoveringEnv(num_envs=2)
-    actor = make_actor(env)
-    value = make_value(env, in_keys=["observation", ("state", "rotor_speed")])
-    rollout, _ = differentiable_rollout(env, actor, None, 3)
-    loss = SHACLoss(actor, value)
-    assert ("next", "state", "rotor_speed") in loss.in_keys and loss(rollout)["loss_value"].isfinite()
-
-
 def test_keys_can_be_renamed():
     actor, value, _ = make_networks()
     loss = SHACLoss(actor, value).make_value_estimator(gamma=GAMMA)
@@ -128,15 +108,6 @@ def test_keys_can_be_renamed():
     result = loss(rollout)
     assert result["loss_actor"] == expected["loss_actor"] and result["loss_value"] == expected["loss_value"]
     assert "goal" in loss.write_value_target(rollout)
-
-
-def test_soft_update_moves_the_target_network():
-    actor, value, _ = make_networks()
-    loss = SHACLoss(actor, value)
-    updater = SoftUpdate(loss, tau=0.25)
-    value.module.weight.data.fill_(20.0)
-    updater.step()
-    assert loss.target_value_network_params["module", "weight"].item() == 12.5
 
 
 def test_a_loss_goes_on_from_a_checkpoint_with_its_discounts():

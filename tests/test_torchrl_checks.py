@@ -119,12 +119,18 @@ def test_parameters_are_those_of_the_networks_can_be_drawn_anew_and_saved(env, n
 
 @each_loss
 def test_a_reduction_gives_numbers_or_one_for_each(env, name):
-    """sac: test_sac_reduction."""
-    rollout = fly(env, build(env, name))
-    for reduction in ("none", "mean", "sum"):
-        out = build(env, name, reduction=reduction)(rollout)
-        shapes = {tuple(x.shape) for key, x in out.items() if key.startswith("loss_")}
+    """sac: test_sac_reduction. None is TorchRL's other word for the mean; a loss is shown in a line."""
+    rollout, found = fly(env, build(env, name)), {}
+    for reduction in ("none", "mean", "sum", None):
+        torch.manual_seed(0)
+        loss = build(env, name, reduction=reduction)
+        out = found[reduction] = {key: x for key, x in seeded(loss, rollout).items() if key.startswith("loss_")}
+        shapes = {tuple(x.shape) for x in out.values()}
         assert shapes and shapes <= ({(3,), (3, 6)} if reduction == "none" else {()})
+        shown = repr(loss)
+        assert shown.startswith(f"{type(loss).__name__}(actor_network=TanhGaussianActor") and "\n" not in shown
+        assert shown.endswith(f", reduction={reduction or 'mean'!r})")
+    torch.testing.assert_close(found[None], found["mean"], rtol=0, atol=0)
 
 
 @each_critic

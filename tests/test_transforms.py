@@ -155,6 +155,8 @@ def test_transforms_and_memory_fly_inside_the_compiled_step(backend):
         backend=backend,
         wind={"gust": 0.5},
         control_dt=0.005,  # a physics step
+        integrator="euler",
+        action_delay=0,
     )
 
 

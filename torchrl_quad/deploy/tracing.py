@@ -86,6 +86,7 @@ class _Methods:
     def __init__(self, env: QuadrotorEnv, state: State) -> None:
         self.env = env
         self.unjudged: str | None = None
+        self._collided: tuple[Tensors, Tensor] | None = None
         self.changing = [*MEASURED, *(["action_queue"] if "action_queue" in state else [])]
         self.known = {name_of(key): key for key in (*self.changing, *env.task_entries, "step")}
         self.hidden = {f"hidden.{name_of(key)}": key for key in state if key not in self.known.values()}
@@ -124,7 +125,9 @@ class _Methods:
         state, scene = self.state(x) | {key: x[name] for name, key in self.obstacles.items()}, self.env.scene
         if scene is not None:
             state["collided"] = torch.zeros_like(x["step"], dtype=torch.bool)
-            state["collided"] = scene.collided({"position": x["previous.position"]}, state)
+            if self._collided is None or self._collided[0] is not x:  # traced once for all that judge
+                self._collided = x, scene.collided({"position": x["previous.position"]}, state)
+            state["collided"] = self._collided[1]
         return state
 
     def observe(self, x: Tensors) -> Tensors:

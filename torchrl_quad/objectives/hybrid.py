@@ -58,7 +58,7 @@ class HybridLoss(SHACLoss):
         clip_epsilon: how far the ratio of probabilities may move from 1; 0.2 is usual.
         entropy_coeff: the weight of the entropy bonus, next to advantages of standard deviation 1; 0 for none.
         clip_action_gradient: the longest gradient in one action, in running medians of their lengths; null for none.
-        reduction: mean, sum or none, over samples.
+        reduction: mean, sum or none, over samples; null is mean, as in TorchRL.
         loss_function: the distance of the critic from its targets: l2, its square; l1; or smooth_l1.
         decay: the share of the running weight that a rollout leaves as it is.
         average: of a scalar over the processes that train together, if there are several.
@@ -88,7 +88,7 @@ class HybridLoss(SHACLoss):
         clip_action_gradient: Positive | None = 2.0,
         decay: Below1 = 0.9,
         average: Callable[[Tensor], Tensor] | None = None,
-        reduction: Literal["mean", "sum", "none"] = "mean",
+        reduction: Literal["mean", "sum", "none"] | None = "mean",
         loss_function: Literal["l2", "l1", "smooth_l1"] = "l2",
     ) -> None:
         own = {"clip_action_gradient": clip_action_gradient, "reduction": reduction, "loss_function": loss_function}

@@ -117,11 +117,12 @@ def test_rewards_in_any_unit_are_divided_by_the_size_of_returns_and_critics_keep
 
 def test_patience_with_a_run_falls_while_no_evaluation_rises():
     returns = [-10.0, 90.0, 90.9, 91.1, 91.9, *[92.0] * 5]  # a rise is 1 % of the range, 1: at the fourth step
-    curve = [{"steps": 10 * i, "eval/return": x, "eval/solved": 0.0} for i, x in enumerate(returns, 1)]
+    curve = [{"steps": 10 * i, "eval/return": x, "eval/solved": 0.5} for i, x in enumerate(returns, 1)]
     assert [last_rise(curve[:n]) for n in range(1, 11)] == [10, 20, 20, 40, 40, 40, 40, 40, 40, 40]
     assert [patience_left(curve, x) for x in (None, 0.8, 0.6, 0.5)] == [1.0, pytest.approx(0.25), 0.0, 0.0]
     assert patience_left(curve[:9], 0.5) == 1.0  # too few evaluations to say
-    curve[7]["eval/solved"] = 0.02
+    assert patience_left([row | {"eval/solved": 0.4} for row in curve], 0.5) == 1.0  # the task is not solved
+    curve[7]["eval/solved"] = 0.52
     assert last_rise(curve) == 80 and last_rise([*curve, curve[-1] | {"eval/return": float("nan")}]) == 80
 
 

@@ -75,9 +75,10 @@ def last_rise(rows: Sequence[Mapping[str, float]]) -> int:
 def patience_left(rows: Sequence[Mapping[str, float]], patience: float | None, least: int = 10) -> float:
     """What is left of the patience with a run: 1 if the last evaluation rose, 0 if none has for a share ``patience``.
 
-    It is 1 for a run of fewer than ``least`` evaluations, and where ``patience`` is None.
+    It is 1 for a run of fewer than ``least`` evaluations, until one has solved half of its episodes, since returns stay
+    level for long before the first are solved, and where ``patience`` is None.
     """
-    if patience is None or len(rows) < least:
+    if patience is None or len(rows) < least or max(row["eval/solved"] for row in rows) < 0.5:
         return 1.0
     return max(1.0 - (1.0 - last_rise(rows) / rows[-1]["steps"]) / patience, 0.0)
 

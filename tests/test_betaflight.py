@@ -211,6 +211,13 @@ def flown(simulator, loop="contract", dynamics="betaflight"):
     return np.array(found)
 
 
+def test_our_model_of_a_pid_loop_answers_as_the_one_in_mujoco():
+    pytest.importorskip("mujoco")
+    theirs = flown("mujoco", "pid")
+    model, usual = (np.sqrt(np.square(flown("torchrl_quad", dynamics=x) - theirs).mean()) for x in ("pid", "quadrotor"))
+    assert model < 0.01 < 0.03 < usual
+
+
 def is_running(pid):
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"

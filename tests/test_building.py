@@ -19,6 +19,7 @@ from torchrl_quad.training import building
 from torchrl_quad.training.building import (
     AdaptiveOptimizer,
     Optimizer,
+    PatientOptimizer,
     ReturnScale,
     TargetUpdate,
     minibatches,
@@ -78,6 +79,17 @@ def test_a_schedule_goes_from_the_first_to_the_last_learning_rate(schedule, half
     for iteration, rate in ((0, 1e-2), (49.5, halfway), (99, last), (200, last)):
         adam.anneal(iteration)
         assert adam.param_groups[0]["lr"] == pytest.approx(rate)
+
+
+def test_in_a_run_of_any_length_the_limit_falls_with_the_patience_and_the_first_rate_is_the_greatest():
+    adam = optimizer(10, PatientOptimizer, max_kl=8.0)
+    adam.anneal(9)
+    assert [adam.limit_to(patience) for patience in (0.0, 0.5, 1.0)] == pytest.approx([0.16, 4.0, 8.0])
+    rates = []
+    for moved in (0.0, 9.0, 5.0, 0.0, 0.0):
+        adam.adapt(moved)
+        rates.append(adam.param_groups[0]["lr"])
+    assert rates == pytest.approx([1e-2, 1e-2 / 1.5, 1e-2 / 1.5, 1e-2, 1e-2])
 
 
 @pytest.mark.parametrize("unit", [1.0, 1000.0])

@@ -146,7 +146,7 @@ class DoubtfulEnv(HoveringEnv):
 
     ends_on_success = True
     weights = {**HoveringEnv.weights, "attitude": 0.0, "arrival": 20.0, "near": 0.0, "width": 1.0}
-    start_range = (1.0, 0.5, 0.5)
+    start_range, success_radius = (1.0, 0.5, 0.5), 0.3
 
     def initial_state(self, n):
         start = super().initial_state(n)
@@ -159,35 +159,21 @@ class DoubtfulEnv(HoveringEnv):
         return {**super().reward_terms(state), "arrival": arrival, "near": near}
 
 
+NO_ATTITUDE = {"attitude": 0.0}
+
+
 @cases(
-    (
-        "racing",
-        {"reward": "position"},
-        {"gate": 0.0, "attitude": 0.0},
-        "gate, target.* waiting before an arrival pays",
-    ),
-    (
-        DoubtfulEnv,
-        {"success_radius": 0.5},
-        {"arrival": 1.0},
-        "success ends an episode and pays 1.0.* loitering pays more",
-    ),
-    (HoveringEnv, {}, {"survival": 0.0, "attitude": 0.0}, "a step pays -0.0.* crash was not seen: dying is cheap"),
-    (
-        DoubtfulEnv,
-        {},
-        {"near": 10.0, "width": 0.08},
-        "'near' is flat in .* of the flights, those in which it pays least",
-    ),
-    (HoveringEnv, {}, {}, "'attitude' is less than a thousandth of return and gradient"),
+    ("racing", {"gate": 0.0, **NO_ATTITUDE}, "gate, target.* waiting before an arrival pays more than arriving"),
+    (DoubtfulEnv, {"arrival": 1.0}, "success ends an episode and pays 1.1, .*: loitering pays more"),
+    (DoubtfulEnv, {"near": 10.0, "width": 0.08}, "'near' is flat in .* of the flights, those in which it pays least"),
+    (HoveringEnv, {"survival": 0.0, **NO_ATTITUDE}, "a step pays -0.0.* a crash was not seen: dying is cheap"),
+    (HoveringEnv, {}, "'attitude' is less than a thousandth of return and gradient"),
 )
-def test_the_audit_says_in_words_what_keeps_a_policy_from_learning_a_task(task, options, weights, trap, monkeypatch):
-    for name in options.keys() & {"success_radius"}:
-        monkeypatch.setattr(task, name, options.pop(name))
+def test_the_audit_says_in_words_what_keeps_a_policy_from_learning_a_task(task, weights, trap):
+    options = {"reward": "position"} if task == "racing" else {}
     audit = audit_reward(*fly(task, 12, weights=weights, **options), gamma=0.99)
-    (said,) = audit.traps
-    assert re.match(trap, said), said
-    assert f"trap: {said}" in repr(audit)
+    assert len(audit.traps) == 1 and re.match(trap, audit.traps[0]), audit
+    assert f"trap: {audit.traps[0]}" in repr(audit)
 
 
 def shac(rollout_and_actor, critic, **options):

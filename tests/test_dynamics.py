@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 import torch
 from flying import FLOWN
-from refusals import cases
 from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 
 from torchrl_quad import HoveringEnv
 from torchrl_quad.deploy.simulators import vehicle
-from torchrl_quad.dynamics import Betaflight, FlightController, Quadrotor, load_drone, quaternion, rigid_body
+from torchrl_quad.dynamics import PID, Betaflight, FlightController, Quadrotor, load_drone, quaternion, rigid_body
 from torchrl_quad.dynamics.control import Setpoint
 from torchrl_quad.dynamics.gains import rate_loop
 from torchrl_quad.dynamics.model import QuadrotorState
@@ -253,7 +252,8 @@ def test_rotations_agree_with_the_rotation_matrix_and_invert_each_other():
     torch.testing.assert_close(quaternion.rotate(quaternion.multiply(p, q), v), one_by_one)
 
 
-@cases((Quadrotor, False), (Quadrotor, True), (Betaflight, False), (Betaflight, True))
+@pytest.mark.parametrize("own", [False, True])
+@pytest.mark.parametrize("kind", [Quadrotor, PID, Betaflight])
 def test_components_fly_as_tensors_do_with_two_time_constants_and_drag_above_the_centre_of_mass(kind, own):
     params = drone(motor_time_constant=[0.03, 0.06], drag_height=0.02)
     model = kind(params, 0.005, 1, "semi_implicit_euler")

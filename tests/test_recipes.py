@@ -181,7 +181,7 @@ def summary(folder, recipe, *overrides):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("recipe", ["abpt", "bptt", "shac", "sapo", "ahac"])
+@pytest.mark.parametrize("recipe", ["abpt", "bptt", "shac", "sapo", "ahac", "train"])
 def test_every_recipe_learns_to_hover(recipe, tmp_path):
     found = summary(tmp_path, recipe)
     assert found["solved"] >= 0.99 and found["position_error"] < 0.05

@@ -64,6 +64,10 @@ def test_the_reward_of_a_gate_with_a_direction_is_how_fast_the_way_around_into_i
     ahead = forward(env.rotations)[state["gate"][:, 0]]
     still = {**state, "position": state["target"] + 0.3 * ahead, "velocity": -ahead}
     assert (env.reward_terms(still)["towards"] > 0.0).all()  # beyond a missed gate the reward leads back
+    near = {**state, "position": state["target"] - 0.1 * ahead}
+    for speed, lead in ((0.0, -0.4), (2.0, 0.0)):  # before its plane, and not onto it, half of the opening from there
+        led = env.lead({**near, "velocity": speed * ahead})[0]["target"]
+        torch.testing.assert_close(led[:, 0], torch.full_like(led[:, 0], lead))
 
 
 def test_touching_a_frame_is_a_crash_from_wherever_it_comes():

@@ -347,10 +347,9 @@ def _sources(inputs: Inputs) -> list[Tensor | GradientEdge]:
     if isinstance(inputs, nn.Module):
         inputs = [p for p in getattr(inputs, "actor_network_params", inputs).parameters() if p.requires_grad]
     elif isinstance(inputs, Tensor):
-        steps = sources_of_steps(inputs)
-        if steps is not None and not isinstance(steps, Tensor):
-            return [*steps]
-        inputs = [inputs if steps is None else steps]
+        if steps := _steps(inputs):
+            return steps
+        inputs = [inputs]
     sources: list[Any] = [*inputs] if isinstance(inputs, Sequence | Iterator) else []
     if not sources or not all(isinstance(x, Tensor) and x.requires_grad for x in sources):
         raise UserValueError(
@@ -367,12 +366,12 @@ def _gradients(value: Tensor, sources: list[Tensor | GradientEdge]) -> Sequence[
 
 
 def _gradient(value: Tensor, sources: list[Tensor | GradientEdge]) -> Tensor:
-    """The gradient of a scalar as one vector; see :func:`_vector`."""
+    """The gradient of a scalar as one vector."""
     return _vector(_gradients(value, sources), sources)
 
 
 def _vector(grads: Sequence[Tensor | None], sources: list[Tensor | GradientEdge]) -> Tensor:
-    """The gradients in sources, which come first, as one vector in double precision, for the squares of small ones."""
+    """The first gradients, those in sources, as one vector in double precision, for squares of small ones."""
     pairs = zip(grads, sources, strict=False)
     grads = [torch.zeros_like(x) if g is None and isinstance(x, Tensor) else g for g, x in pairs]
     known = [g.flatten().double() for g in grads if g is not None]

@@ -28,7 +28,7 @@ class Slalom(HoveringEnv):
         x, y, z = state["position"].split(1, -1)
         back = torch.cat((0.0 * x, ASIDE * (WAVE * x).cos() - y, 1.5 - z), -1)
         along = torch.cat((torch.ones_like(x), -ASIDE * WAVE * (WAVE * x).sin(), 0.0 * x), -1)
-        return state["velocity"] - (4.5 * GAP - x).clamp(-1.5, 1.5) * along - 2.0 * back
+        return state["velocity"] - (2.0 * (4.5 * GAP - x)).clamp(-1.5, 1.5) * along - 2.0 * back
 
     def observe(self, state):
         return torch.cat((self.slip(state), super().observe(state)), -1)

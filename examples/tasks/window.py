@@ -24,5 +24,5 @@ class Window(HoveringEnv):
         share = (1.0 + state["position"][..., :1]).clamp(0.0, 1.0)  # aims at the window, and ever farther behind it
         aim = torch.lerp(self.tensor([0.2, 0.0, 1.5]).expand_as(state["target"]), state["target"], share)
         way = aim - state["position"]
-        left, slip = norm(way) + norm(state["target"] - aim), state["velocity"] - shortened(way, 1.5)
+        left, slip = norm(way) + norm(state["target"] - aim), state["velocity"] - shortened(2.0 * way, 1.5)
         return penalties(self.weights, way=left, slip=slip, spin=state["angular_velocity"])

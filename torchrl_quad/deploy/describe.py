@@ -21,6 +21,7 @@ from torchrl_quad.deploy.contract import GRAPHS, MEASURED, Contract, Fields, sch
 from torchrl_quad.deploy.network import fill_in
 from torchrl_quad.deploy.tracing import Rules
 from torchrl_quad.dynamics import CONTROLS, DYNAMICS, QuadrotorParams, make_controller
+from torchrl_quad.dynamics.firmware import PIDController
 from torchrl_quad.dynamics.parameters import LIMITS
 from torchrl_quad.envs import TASKS, QuadrotorEnv
 from torchrl_quad.envs.disturbances import DroneRandomization, Sensors, Wind
@@ -229,12 +230,16 @@ def _rate_loop(env: QuadrotorEnv, drone: Contract) -> Fields | None:
         "one would leave its limits, in this order: roll and pitch torque shrink by one factor, if they need more than "
         "the whole range; collective thrust moves by as little as makes room for them; yaw torque shrinks to what fits"
     )
-    if type(getattr(env.dynamics, "controller", None)) not in CONTROLS.values():
+    if type(getattr(env.dynamics, "controller", None)) not in (*CONTROLS.values(), PIDController):
         torque = inspect.cleandoc(type(env.dynamics).__doc__ or "")[:2000]
     if "rate_integral" in env.dynamics.sizes:
+        torque = torque.replace(", and there is no integral", "")
+        rest, slow = ", unless a rotor is asked for more than it can", ""
+        if "slow_rate" in env.dynamics.sizes:
+            rest, slow = " max(0, 1 - |commanded - l| / 40 deg/s)", "l += (1 - exp(-2 pi 15 dt)) (commanded - l) and "
         law += (
-            ". With desired = commanded + i; each step also l += (1 - exp(-2 pi 15 dt)) (commanded - l) and "
-            "i += dt 0.1 B (commanded - w) max(0, 1 - |commanded - l| / 40 deg/s), B being the bandwidth for dt to 0"
+            f". With desired = commanded + i; each step also {slow}i += dt 0.1 B (commanded - w){rest}, B being the "
+            "bandwidth for dt to 0"
         )
     return {"law": law, "torque": torque, "gain": drone["rate_gain"], **values}
 

@@ -10,7 +10,7 @@ from torchrl_quad.dynamics.control import (
     VelocityController,
     make_controller,
 )
-from torchrl_quad.dynamics.firmware import Betaflight
+from torchrl_quad.dynamics.firmware import PID, Betaflight
 from torchrl_quad.dynamics.gains import suggest_gains
 from torchrl_quad.dynamics.importing import import_drone, load_drone
 from torchrl_quad.dynamics.model import Dynamics, PointMass, Quadrotor, QuadrotorState
@@ -21,6 +21,7 @@ from torchrl_quad.dynamics.rigid_body import INTEGRATORS, RigidBodyState, accele
 DYNAMICS: dict[str, type[Dynamics]] = {
     "quadrotor": Quadrotor,
     "point_mass": PointMass,
+    "pid": PID,
     "betaflight": Betaflight,
 }
 
@@ -28,6 +29,7 @@ __all__ = [
     "CONTROLS",
     "DYNAMICS",
     "INTEGRATORS",
+    "PID",
     "AttitudeController",
     "Betaflight",
     "Dynamics",

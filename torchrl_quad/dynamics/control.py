@@ -136,12 +136,16 @@ class FlightController:
         from the wrench that nominal rotors exert; the setpoint is held, so that the paper's derivative of the desired
         rate is zero. The moment of a drag above the centre of mass disturbs this loop, as it does any without integral.
         """
+        thrust, torque = self.asked(setpoint, angular_velocity, wrench)
+        return self.rotors.speed(self._within_limits(thrust, setpoint.thrust, torque[..., 2:]))
+
+    def asked(self, setpoint: Setpoint, angular_velocity: Vector, wrench: Vector) -> tuple[Vector, Vector]:
+        """The thrusts (*, n) [N] that the mixer asks of the rotors, and the torque (*, 3) [N m] for which it does."""
         held = gyroscopic_torque(angular_velocity, self.nominal.inertia)
         acceleration = (wrench[..., 1:4] - held) / self.nominal.inertia
         torque = held.addcmul(self.gain, setpoint.body_rate - angular_velocity)
         torque = torque - self.nominal.rate_damping * acceleration
-        thrust = matvec(self.mixer, cat(setpoint.thrust, torque))
-        return self.rotors.speed(self._within_limits(thrust, setpoint.thrust, torque[..., 2:]))
+        return matvec(self.mixer, cat(setpoint.thrust, torque)), torque
 
     def _within_limits(self, thrust: Vector, collective: Vector, yaw_torque: Vector) -> Vector:
         """The rotor thrusts (*, n) [N] that can be flown, for what the mixer asks of them."""

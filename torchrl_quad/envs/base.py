@@ -69,7 +69,8 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         control: what an action (4) in [-1, 1] commands: "rates" (thrust, body rates), "attitude" (thrust, roll, pitch,
             yaw rate), "rotor_thrusts" (n, of n rotors), "velocity" (and yaw rate), or a mapping with limits, such as
             {mode: velocity, max_speed: 5.0}. See ``docs/actions.md``.
-        firmware: "betaflight" for the rate loop of :class:`~torchrl_quad.dynamics.Betaflight`, to train for it.
+        firmware: "betaflight" or "pid", to train for the rate loop of :class:`~torchrl_quad.dynamics.Betaflight` or
+            :class:`~torchrl_quad.dynamics.PID`.
         dt: the physics step, 1e-6 to 0.1 s.
         control_dt: the control step, 1e-6 to 1 s, 1 to 200 times dt. Hovering is judged by its last second.
         action_delay: control steps from a command to its effect, 0 to 1000; 1 is usual.

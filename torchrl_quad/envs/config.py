@@ -58,7 +58,7 @@ DroneOption = Annotated[
     Any, accepted(lambda x: isinstance(x, str | Path | Mapping | QuadrotorParams) and x != "", _DRONE)
 ]
 DynamicsOption = Annotated[Any, AfterValidator(_dynamics)]
-FirmwareOption = Literal["betaflight"] | None
+FirmwareOption = Literal["pid", "betaflight"] | None
 ControlOption = Annotated[
     Any, accepted(lambda x: isinstance(x, str | Mapping), "a name, such as rates, or a mapping with limits")
 ]

@@ -31,6 +31,9 @@ FirstGate = Annotated[int, between(0, 999)]
 START_ROOM = 0.05  # [m], to the sides of the box, at least
 FUNNEL = 0.5  # how far before a gate the reward leads, as a share of the way to the axis of the gate
 ROUND = 0.1  # [m], from the axis, where the way to it is rounded off
+SLOW = (
+    1.0  # [m/s], towards a gate; a slower drone is led back before its plane, and not just onto it, where it would hang
+)
 SAMPLES = 8  # of the way of a step, on which it may touch the frame of a gate
 
 
@@ -53,7 +56,8 @@ class RacingEnv(QuadrotorEnv):
     velocity towards the next gate, v_a the part of the velocity across that direction, and d the distance to the gate
     [m]. Reward "position": that of hovering, with the next gate as its target, and a gate bonus of 20. Where gates have
     a direction, d and v_a are about a point on the axis of the gate, before it by half of the drone's distance from the
-    axis, and by the drone's way beyond the gate; v_t is how fast the way over that point gets shorter. A step that
+    axis, and by the drone's way beyond the gate, which for a drone slower than 1 m/s begins up to half of the smallest
+    opening before the gate; v_t is how fast the way over that point gets shorter. A step that
     crosses the plane of such a gate elsewhere takes up to a bonus away, tanh(m) of it at m [m] from half of the
     opening. The binary bonus is paid in the step that passes a gate and carries no gradient; with ``event_discount``
     the time at which the drone enters the gate's sphere, or crosses its plane, does. Two relaxations replace the bonus
@@ -339,14 +343,15 @@ class RacingEnv(QuadrotorEnv):
         """Where the reward leads, to a gate with a direction: the state in the frame of that gate, x in its direction.
 
         The target is a point on its axis, before it by half of the way to the axis, and farther for a drone that is
-        beyond it: at the gate itself no way back would be rewarded. Then how fast that grows, (n, 1) [m/s]; and from 0
-        to 1 by how far a drone passes the gate that has just crossed its plane, (n, 1).
+        beyond it, or slow and nearly there: at the gate itself no way back would be rewarded. Then how fast that grows,
+        (n, 1) [m/s]; and from 0 to 1 by how far a drone passes the gate that has just crossed its plane, (n, 1).
         """
         rotation, gap = self.pose(state, state["gate"])[1], state["position"] - state["target"]
         place, velocity = (quaternion.rotate_inverse(rotation, x) for x in (gap, state["velocity"]))
         along, aside, speed = place[:, :1], place[:, 1:], velocity[:, :1]
         off = (aside.square().sum(-1, keepdim=True) + ROUND**2).sqrt()
-        beyond = along - 2.0 * self.control_dt * speed.clamp_min(0.0)  # not in the step that crosses the plane
+        back = self.gate_radius * (1.0 - speed / SLOW).clamp(0.0, 1.0)
+        beyond = along + back - 2.0 * self.control_dt * speed.clamp_min(0.0)  # not in the step that crosses the plane
         before = FUNNEL * (off - ROUND) + beyond.clamp_min(0.0)
         growth = FUNNEL * (aside * velocity[:, 1:]).sum(-1, keepdim=True) / off + torch.where(beyond > 0.0, speed, 0.0)
         outside = _outside(aside, 0.5 * self.openings[state["gate"][:, 0]]).amax(-1, keepdim=True).clamp_min(0.0)

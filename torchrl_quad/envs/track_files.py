@@ -35,11 +35,7 @@ def own_format(source: str, values: Mapping[str, Any]) -> dict[str, Any]:
     try:
         if isinstance(values.get("env"), Mapping):
             return lsy_drone_racing(source, values)
-        if (
-            isinstance(gates, Mapping)
-            and named
-            and all({"position", "rotation"} <= set(gate) for gate in named.values())
-        ):
+        if named and isinstance(gates, Mapping) and all({"position", "rotation"} <= set(x) for x in named.values()):
             return agile_flight(source, values, _in_order(named))
         if named and all({"pos", "yaw"} <= set(gate) for gate in named.values()):
             return isaac_drone_racer(source, values, _in_order(named))
@@ -128,15 +124,8 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
     if track.get("randomize", False) or "random" in values:  # of positions it says nothing but the limits
         low, high = box
         reach = min(high[i] - low[i] for i in (0, 1)) / 2.0
-        heights = centres[:, 2].tolist()
-        own["random"] = {
-            "gates": len(centres),
-            "spacing": [1.0, 1.1 * reach],
-            "heights": heights,
-            "turn": 2.2,
-            "yaw": 0.75,
-            **(values.get("random") or {}),
-        }
+        rules = {"gates": len(centres), "spacing": [1.0, 1.1 * reach], "heights": centres[:, 2].tolist()}
+        own["random"] = {**rules, "turn": 2.2, "yaw": 0.75, **(values.get("random") or {})}
         notes.append("gates stand anew in each episode, by the rules of random tracks; no poles")
         return own
     drawn = {name: _spread(source, x) for name, x in values["env"].get("randomizations", {}).items()}

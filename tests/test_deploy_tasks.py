@@ -62,7 +62,10 @@ def harder(name):
     return env, pilot(env, **PILOTS.get(task, {}))
 
 
-@pytest.mark.parametrize("task", HARDER)
+SLOW = ["ring"]  # another task of one's own, beside the relay
+
+
+@pytest.mark.parametrize("task", [pytest.param(x, marks=[pytest.mark.slow] * (x in SLOW)) for x in HARDER])
 def test_flights_are_judged_as_the_environment_judges_them(export_once, task):
     """In flights of its own, and in those of a bundle in our simulator, of tasks of one's own, too."""
     env, actor, folder = export_once(f"{task}, harder", harder)

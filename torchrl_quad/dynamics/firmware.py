@@ -66,14 +66,14 @@ class PID(Quadrotor):
     """
 
     sizes = {**Quadrotor.sizes, "rate_integral": 3}
-    loop: type[PIDController] = PIDController
+    _loop = PIDController
 
     def finish(self) -> None:
         """Refuse other controllers than that of body rates, whose place this one takes."""
         super().finish()
         if type(self.controller) is not FlightController:
             raise UserValueError("firmware=... flies body rates. Leave out control=..., or firmware.")
-        self.controller = self.loop(self.nominal)
+        self.controller = self._loop(self.nominal)
 
     def physics_step(
         self, state: Sequence[Vector], setpoint: Any, plant: Any, controller: Any, wind: Vector | None
@@ -105,7 +105,7 @@ class Betaflight(PID):
     """
 
     sizes = {**PID.sizes, "slow_rate": 3}
-    loop: type[PIDController] = FirmwareController
+    _loop = FirmwareController
 
     def finish(self) -> None:
         """Work out the filter."""

@@ -62,7 +62,9 @@ class Drone:
 
     def __eq__(self, other: object) -> bool:
         """Whether all numbers are the same."""
-        return isinstance(other, Drone) and all(np.array_equal(x, vars(other)[name]) for name, x in vars(self).items())
+        if not isinstance(other, Drone) or vars(self).keys() != vars(other).keys():
+            return False
+        return all(np.array_equal(x, vars(other)[name]) for name, x in vars(self).items())
 
     def thrust(self, speed: Array) -> Array:
         """Thrust [N] of rotors that turn at a speed [rad/s]."""

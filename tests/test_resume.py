@@ -137,6 +137,40 @@ def test_a_run_ends_when_its_evaluation_has_levelled_off_says_so_and_goes_on_wit
     assert len(rows(tmp_path)) == 20
 
 
+def test_a_run_that_lost_half_of_what_it_solved_goes_back_to_its_best_policy_at_half_the_rate(
+    train, launch, no_pictures, tmp_path, monkeypatch
+):
+    script, saved = [0.4, 0.1, 0.8, 0.4, 0.39, 0.2, 0.9, 0.5], {}
+    save = loop.Run._save
+
+    def keep(self, path):
+        save(self, path)
+        saved[self.iteration] = read_checkpoint(path)
+        if self.folder.name == "stopped" and self.iteration == 5 and not self.cfg.resume:
+            raise KeyboardInterrupt
+
+    def evaluate(*_):
+        return {"eval/return": 1.0, "eval/solved": script[len(seen)]}, seen.append(0)
+
+    monkeypatch.setattr(loop.Run, "_save", keep)
+    monkeypatch.setattr(loop, "evaluate", evaluate)
+    options, seen = ["eval.interval=1", "eval.patience=0.9", "actor.average=0.5"], []
+    straight = train("train", tmp_path / "straight", *options)
+    shares = [saved[i]["stateful"][1]["param_groups"][0].pop("share", 1.0) for i in range(1, 9)]
+    assert shares == [1.0, 1.0, 1.0, 1.0, 0.5, 0.25, 0.25, 0.25]
+    for lost in (5, 6):  # policy, critics, their optimisers, scale, average
+        assert_equal(saved[lost]["stateful"], saved[3]["stateful"])
+    assert not torch.equal(saved[4]["stateful"][3]["square"], saved[3]["stateful"][3]["square"])
+    assert saved[8]["best"]["steps"] == saved[7]["steps"]
+    seen = []
+    with pytest.raises(SystemExit):
+        train("train", tmp_path / "stopped", *options)
+    straight["stateful"] = saved[8]["stateful"]
+    resumed = train("train", tmp_path / "stopped", "resume=auto")
+    assert resumed["stateful"][1]["param_groups"][0].pop("share") == 0.25
+    assert_equal(straight, resumed)
+
+
 def test_what_the_command_line_says_must_agree_with_the_checkpoint(train, refused, tmp_path):
     train("bptt", tmp_path)
     small = [*SMALL, f"hydra.run.dir={tmp_path}"]

@@ -54,8 +54,8 @@ def mean_of_all(x: Tensor) -> Tensor:
     return cat_all(x.detach().view(1)).mean()
 
 
-def of_first(x: float) -> float:
-    """The number that the first of the processes has."""
+def of_first(x: Any) -> Any:
+    """What the first of the processes has."""
     values = [x]
     if world_size() > 1:
         dist.broadcast_object_list(values)
@@ -184,7 +184,7 @@ class Optimizer(torch.optim.Adam):
         # A function of the finished share of the run, so that a run can be resumed and made longer.
         share = min(iteration / max(self.iterations - 1, 1), 1.0)
         for group in self.param_groups:
-            group["lr"] = self.first_lr * self.factor(share)
+            group["lr"] = self.first_lr * self.factor(share) * group.get("share", 1.0)
 
 
 class AdaptiveOptimizer(Optimizer):

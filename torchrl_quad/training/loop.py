@@ -72,7 +72,9 @@ class Run:
 
     Every ``eval.interval`` iterations the run writes a row of metrics and a checkpoint, which holds all that it needs
     to continue bit for bit, and the best policy so far: the one that solved most episodes in an evaluation, and of
-    those the one with the greatest return. At the end that policy flies from other starts.
+    those the one with the greatest return. At the end that policy flies from other starts. With ``eval.patience``, a
+    run that solves less than half of what this policy solved goes back to it, with its critics and optimisers, at half
+    the actor's rate.
 
     The seconds are those of the loop, without set-up, compilation, evaluations and checkpoints.
 
@@ -165,12 +167,17 @@ class Run:
                 self.steps += self.horizon * self.drones
                 bar.update(self.horizon * self.drones)
                 if self.iteration % self.cfg.eval.interval == 0 or self.steps >= self.total_steps:
+                    best = None
                     if rank() == 0:
                         metrics = self._evaluate()
                         solved = metrics["eval/solved"]
                         bar.set_postfix_str(f"return {metrics['eval/return']:.2f}, solved {solved:.0%}")
                         self.levelled_off = has_levelled_off(self.rows, self.cfg.eval.patience)
-                    self.levelled_off = of_first(self.levelled_off)
+                        if 0.5 <= self.best["solved"] > 2.0 * solved:
+                            best = self.best.get("stateful")
+                    self.levelled_off, best = of_first((self.levelled_off, best))
+                    if best is not None:
+                        self._roll_back(best)
                     self.recorded.clear()
                     self.starts.clear()
                     self._save(self.folder / "checkpoint.pt")
@@ -273,7 +280,19 @@ class Run:
             policy = {"actor": self.flown, "normalizer": self.normalizer}
             weights = {name: copy.deepcopy(x.state_dict()) for name, x in policy.items() if x is not None}
             self.best = {**score, "steps": self.steps, **weights}
+            if self.cfg.eval.patience is not None:
+                self.best["stateful"] = copy.deepcopy([x.state_dict() for x in self.stateful])
         return metrics
+
+    def _roll_back(self, stateful: list[dict[str, Any]]) -> None:
+        """Go back to the best policy with all that belonged to it, from fresh starts, at half the rate of the actor."""
+        for x, state in zip(self.stateful, copy.deepcopy(stateful), strict=True):
+            share = x.param_groups[0].get("share", 1.0) if isinstance(x, Optimizer) else 1.0
+            x.load_state_dict(state)
+            if isinstance(x, Optimizer) and x.name == "actor":
+                for group in x.param_groups:
+                    group["share"] = share / 2
+        self.carry = self.env.reset()
 
     def _diagnose(self) -> dict[str, float]:
         """Measure what reward and gradient of the next horizon are made of; change nothing."""

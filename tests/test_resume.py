@@ -166,7 +166,7 @@ def test_a_run_that_lost_half_of_what_it_solved_goes_back_to_its_best_policy_at_
     with pytest.raises(SystemExit):
         train("train", tmp_path / "stopped", *options)
     straight["stateful"] = saved[8]["stateful"]
-    resumed = train("train", tmp_path / "stopped", "resume=auto")
+    resumed = train("train", tmp_path / "stopped", *options, "resume=auto")
     assert resumed["stateful"][1]["param_groups"][0].pop("share") == 0.25
     assert_equal(straight, resumed)
 

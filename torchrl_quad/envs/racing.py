@@ -25,15 +25,15 @@ WEIGHTS = {  # of the reward's terms, by reward
     "position": {**terms.TARGET_WEIGHTS, "gate": 20.0},
     "velocity": {"towards": 0.02, "across": 0.02, "angular_velocity": 0.001, "gate": 5.0},
 }
+BOX_WEIGHT = 0.5  # of flying too fast towards a side of the box, where gates have a direction
 RELAXATION_WEIGHTS = {"log": {"gate": 5.0}, "reciprocal": {"gate": 1.0}}
 GATES, ROTATIONS = ("track", "gates"), ("track", "rotations")  # in the state, where each episode has another track
 FirstGate = Annotated[int, between(0, 999)]
 START_ROOM = 0.05  # [m], to the sides of the box, at least
 FUNNEL = 0.5  # how far before a gate the reward leads, as a share of the way to the axis of the gate
 ROUND = 0.1  # [m], from the axis, where the way to it is rounded off
-SLOW = (
-    1.0  # [m/s], towards a gate; a slower drone is led back before its plane, and not just onto it, where it would hang
-)
+SLOW = 1.0  # [m/s], towards a gate: slower drones are led back before its plane, since they would hang at it
+BRAKING, LEAST_ROOM = 15.0, 0.05  # [m/s2], what costs nothing; [m], below which a side of the box gets no nearer
 SAMPLES = 8  # of the way of a step, on which it may touch the frame of a gate
 
 
@@ -54,14 +54,18 @@ class RacingEnv(QuadrotorEnv):
 
     Reward "velocity": 0.02 min(v_t, 15) - 0.02 |v_a| / (d + 1) - 0.001 |w|, and a gate bonus of 5, where v_t is the
     velocity towards the next gate, v_a the part of the velocity across that direction, and d the distance to the gate
-    [m]. Reward "position": that of hovering, with the next gate as its target, and a gate bonus of 20. Where gates have
-    a direction, d and v_a are about a point on the axis of the gate, before it by half of the drone's distance from the
-    axis, and by the drone's way beyond the gate, which for a drone slower than 1 m/s begins up to half of the smallest
-    opening before the gate; v_t is how fast the way over that point gets shorter. A step that
-    crosses the plane of such a gate elsewhere takes up to a bonus away, tanh(m) of it at m [m] from half of the
-    opening. The binary bonus is paid in the step that passes a gate and carries no gradient; with ``event_discount``
-    the time at which the drone enters the gate's sphere, or crosses its plane, does. Two relaxations replace the bonus
-    by one in each step: "log", -5 log(d + 0.01), and "reciprocal", 1 / (d + 0.05).
+    [m]. Reward "position": that of hovering, with the next gate as its target, and a gate bonus of 20. The binary bonus
+    is paid in the step that passes a gate and carries no gradient; with ``event_discount`` the time at which the drone
+    enters the gate's sphere, or crosses its plane, does. Two relaxations replace the bonus by one in each step: "log",
+    -5 log(d + 0.01), and "reciprocal", 1 / (d + 0.05).
+
+    Where gates have a direction, d and v_a are about a point on the axis of the gate, before it by half of the drone's
+    distance from the axis, and by the drone's way beyond the gate, which for a drone slower than 1 m/s begins up to
+    half of the smallest opening before the gate; v_t is how fast the way over that point gets shorter. A step that
+    crosses the plane of the gate elsewhere, or touches a frame, takes up to a bonus away, tanh(m) of it at m [m] from
+    half of the opening. A drone pays 0.5 log(a / 15) for each side of the box ahead that takes more than 15 m/s2 to
+    stop before, a = v^2 / (2 d) with the speed v towards it and the distance d: that it would crash there has no
+    gradient. ``weights={"box": 0.5}`` does so with spheres, too.
 
     A gate that is a point is passed when the straight line that the drone flew in a control step comes within 0.3 m of
     it. A gate with a direction is passed when that line crosses its plane, from behind, within its opening. The reward
@@ -152,6 +156,7 @@ class RacingEnv(QuadrotorEnv):
         self.ends_on_success = not self.is_closed
         self.start_range = self.track.get("start_range", self.start_range)
         self.weights = {**WEIGHTS[reward], **RELAXATION_WEIGHTS.get(gate_bonus, {})}
+        self.weights["box"] = 0.0 if "gate_radius" in self.track else BOX_WEIGHT
         if "scene" in self.track and kwargs.get("scene") is None:
             kwargs["scene"] = self.track["scene"]
         super().__init__(num_envs, max_episode_steps=max_episode_steps, **kwargs)
@@ -355,9 +360,16 @@ class RacingEnv(QuadrotorEnv):
         before = FUNNEL * (off - ROUND) + beyond.clamp_min(0.0)
         growth = FUNNEL * (aside * velocity[:, 1:]).sum(-1, keepdim=True) / off + torch.where(beyond > 0.0, speed, 0.0)
         outside = _outside(aside, 0.5 * self.openings[state["gate"][:, 0]]).amax(-1, keepdim=True).clamp_min(0.0)
-        crossed = (along >= 0.0) & (along < self.control_dt * speed) & ~state["gate_passed"]  # when another was next
-        missed = torch.where(crossed, outside.tanh(), 0.0)
+        missed = (along >= 0.0) & (along < self.control_dt * speed)
+        missed = missed | state["frame_touched"] if self.frame else missed
+        missed = torch.where(missed & ~state["gate_passed"], outside.tanh(), 0.0)  # passed: when another was next
         return {**state, "position": place, "velocity": velocity, "target": pad(-before, (0, 2))}, growth, missed
+
+    def braking(self, state: State) -> Tensor:
+        """What would stop a drone just before the sides of the box that are ahead of it, (n, 3) [m/s2]."""
+        gap, velocity = state["position"] - self.centre, state["velocity"]
+        room = self.half_box - torch.where(velocity > 0.0, gap, -gap)
+        return velocity.square() / (2.0 * room.clamp_min(LEAST_ROOM))
 
     def reward_terms(self, state: State) -> State:
         bonus = state["gate_passed"].to(self.dtype)
@@ -379,6 +391,9 @@ class RacingEnv(QuadrotorEnv):
                 "across": -self.weights["across"] * across / (gap + 1.0),
                 "angular_velocity": -self.weights["angular_velocity"] * terms.norm(state["angular_velocity"]),
             }
+        if self.weights["box"]:
+            harder = (self.braking(state) / BRAKING).clamp_min(1.0).log()
+            rewards["box"] = -self.weights["box"] * harder.sum(-1, keepdim=True)
         if self.gate_bonus != "binary":
             bonus = -torch.log(gap + 0.01) if self.gate_bonus == "log" else 1.0 / (gap + 0.05)
         return {**rewards, "gate": self.weights["gate"] * bonus}

@@ -20,6 +20,7 @@ from torchrl_quad.envs.scenes import reach_of
 from torchrl_quad.envs.track import MARGIN, Course, TrackOption, forward, load_track, starts_before
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.options import Size, between
+from torchrl_quad.vision.primitives import from_faces
 
 WEIGHTS = {  # of the reward's terms, by reward
     "position": {**terms.TARGET_WEIGHTS, "gate": 20.0},
@@ -281,9 +282,9 @@ class RacingEnv(QuadrotorEnv):
         crossing = (-start[..., :1] / torch.where(way[..., :1] == 0.0, 1.0, way[..., :1])).clamp(0.0, 1.0)
         share = torch.cat((share + 0.0 * crossing, crossing), -1).unsqueeze(-1)  # (n, k, instants, 1)
         along, aside = (start.unsqueeze(2) + share * way.unsqueeze(2)).split((1, 2), -1)
-        beyond = _outside(aside, self.openings.unsqueeze(1))
-        bars = torch.maximum(_box(beyond - self.frame), -beyond.amax(-1, keepdim=True))
-        distance = _box(torch.cat((bars, along.abs() - 0.5 * self.frame), -1))
+        beyond = _outside(aside, self.openings.unsqueeze(1)).unbind(-1)
+        bars = torch.maximum(from_faces(*(x - self.frame for x in beyond)), -torch.stack(beyond).amax(0))
+        distance = from_faces(bars, along.squeeze(-1).abs() - 0.5 * self.frame)
         return (distance < self.drone_radius).flatten(1).any(1, keepdim=True)
 
     def advance(self, previous: State, state: State) -> State:
@@ -443,8 +444,3 @@ def _metres(point: Tensor) -> list[float]:
 def _outside(aside: Tensor, opening: Tensor) -> Tensor:
     """How far places (*, 2) in the plane of a gate are beyond the edges of its opening (*, 1 or 2)."""
     return (terms.norm(aside) if opening.shape[-1] == 1 else aside.abs()) - opening
-
-
-def _box(beyond: Tensor) -> Tensor:
-    """The signed distance (*, 1) from a box, from how far a point lies beyond each of its faces (*, k)."""
-    return terms.norm(beyond.clamp_min(0.0)) + beyond.amax(-1, keepdim=True).clamp_max(0.0)

@@ -366,15 +366,8 @@ class RacingEnv(QuadrotorEnv):
         missed = torch.where(missed & ~state["gate_passed"], outside.tanh(), 0.0)  # passed: when another was next
         return {**state, "position": place, "velocity": velocity, "target": pad(-before, (0, 2))}, growth, missed
 
-    def braking(self, state: State) -> Tensor:
-        """What would stop a drone just before the sides of the box that are ahead of it, (n, 3) [m/s2]."""
-        gap, velocity = state["position"] - self.centre, state["velocity"]
-        room = self.half_box - torch.where(velocity > 0.0, gap, -gap)
-        return velocity.square() / (2.0 * room.clamp_min(LEAST_ROOM))
-
     def reward_terms(self, state: State) -> State:
-        bonus = state["gate_passed"].to(self.dtype)
-        growth = None
+        bonus, growth, world = state["gate_passed"].to(self.dtype), None, state
         if self.is_directed:
             state, growth, missed = self.lead(state)
             bonus = bonus - missed
@@ -393,8 +386,10 @@ class RacingEnv(QuadrotorEnv):
                 "angular_velocity": -self.weights["angular_velocity"] * terms.norm(state["angular_velocity"]),
             }
         if self.weights["box"]:
-            harder = (self.braking(state) / BRAKING).clamp_min(1.0).log()
-            rewards["box"] = -self.weights["box"] * harder.sum(-1, keepdim=True)
+            place, velocity = world["position"] - self.centre, world["velocity"]
+            room = (self.half_box - torch.where(velocity > 0.0, place, -place)).clamp_min(LEAST_ROOM)  # ahead
+            needed = velocity.square() / (2.0 * BRAKING * room)
+            rewards["box"] = -self.weights["box"] * needed.clamp_min(1.0).log().sum(-1, keepdim=True)
         if self.gate_bonus != "binary":
             bonus = -torch.log(gap + 0.01) if self.gate_bonus == "log" else 1.0 / (gap + 0.05)
         return {**rewards, "gate": self.weights["gate"] * bonus}

@@ -256,19 +256,14 @@ class RacingEnv(QuadrotorEnv):
             found = [x[0, gate[:, 0]] for x in own]
         return found[0], found[-1]
 
-    def local(self, previous: State, state: State) -> tuple[Tensor, Tensor]:
-        """Both ends of a step, each (n, 3) [m], in the frame of the gate that was next: x in its direction."""
+    def crossing(self, previous: State, state: State) -> tuple[Tensor, Tensor]:
+        """When a step crosses the plane of the gate that was next, as a fraction of the step with its gradient, (n, 1),
+        and whether it does so in its direction and within its opening, (n, 1)."""
         centre, rotation = self.pose(previous, previous["gate"])
         start, end = (quaternion.rotate_inverse(rotation, x["position"] - centre) for x in (previous, state))
-        return start, end
-
-    def crosses(self, previous: State, state: State) -> Tensor:
-        """Whether a step crosses the plane of the next gate, in its direction and within its opening, (n, 1)."""
-        start, end = self.local(previous, state)
-        behind, beyond = start[:, :1], end[:, :1]
-        off = torch.lerp(start, end, -behind / (beyond - behind).clamp_min(1e-12))[:, 1:]
-        off = _outside(off, self.openings[previous["gate"][:, 0]])
-        return (behind < 0.0) & (beyond >= 0.0) & (off < 0.0).all(-1, keepdim=True)
+        time = terms.level_crossing(-start[:, :1], -end[:, :1], 0.0)
+        off = _outside(torch.lerp(start, end, time)[:, 1:], self.openings[previous["gate"][:, 0]])
+        return time, (start[:, :1] < 0.0) & (end[:, :1] >= 0.0) & (off < 0.0).all(-1, keepdim=True)
 
     def touches(self, previous: State, state: State) -> Tensor:
         """Whether a step touches the frame of any gate, (n, 1): bars around the opening, as deep as they are wide.
@@ -291,7 +286,7 @@ class RacingEnv(QuadrotorEnv):
         gate, step = previous["gate"], state["step"]
         with torch.no_grad():  # how close to the gate the straight line between the two positions comes
             if self.is_directed:
-                passed = self.crosses(previous, state)
+                _, passed = self.crossing(previous, state)
             else:
                 start, (centre, _) = previous["position"], self.pose(previous, gate)
                 line = state["position"] - start
@@ -322,8 +317,7 @@ class RacingEnv(QuadrotorEnv):
         if self.gate_bonus != "binary":
             return {}
         if self.is_directed:
-            start, end = self.local(previous, state)
-            time = terms.level_crossing(-start[:, :1], -end[:, :1], 0.0)
+            time, _ = self.crossing(previous, state)
         else:
             ends = previous["position"], state["position"]
             time = terms.ball_entry(*ends, previous["target"], self.gate_radius)

@@ -72,15 +72,15 @@ def last_rise(rows: Sequence[Mapping[str, float]]) -> int:
     return rose
 
 
-def patience_left(rows: Sequence[Mapping[str, float]], patience: float | None, least: int = 10) -> float:
-    """What is left of the patience with a run: 1 if the last evaluation rose, 0 if none has for a share ``patience``.
+def has_levelled_off(rows: Sequence[Mapping[str, float]], patience: float | None, least: int = 10) -> bool:
+    """Whether no evaluation of a run has risen for a share ``patience`` of it; never where that is None.
 
-    It is 1 for a run of fewer than ``least`` evaluations, until one has solved half of its episodes, since returns stay
-    level for long before the first are solved, and where ``patience`` is None.
+    A run of fewer than ``least`` evaluations goes on, and so does one that has not solved half of an evaluation's
+    episodes, since returns stay level for long before the first are solved.
     """
     if patience is None or len(rows) < least or max(row["eval/solved"] for row in rows) < 0.5:
-        return 1.0
-    return max(1.0 - (1.0 - last_rise(rows) / rows[-1]["steps"]) / patience, 0.0)
+        return False
+    return last_rise(rows) <= (1.0 - patience) * rows[-1]["steps"]
 
 
 @contextlib.contextmanager

@@ -54,8 +54,8 @@ from torchrl_quad.training.evaluation import (
     drawing_from,
     evaluate,
     final_evaluation,
+    has_levelled_off,
     last_rise,
-    patience_left,
     print_summary,
     rounds,
     title,
@@ -85,7 +85,7 @@ class Run:
     Attributes:
         carry: where the next horizon starts; the algorithm sets it in each iteration.
         horizon: control steps of this iteration's rollout, ``cfg.horizon`` unless the algorithm sets it.
-        patience: the share of ``eval.patience`` that is left; at 0 the run ends.
+        levelled_off: whether its evaluations have, by ``eval.patience``; then it ends.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class Run:
         logger_state = self._load(Path(cfg.resume)) if cfg.resume else None
         if not cfg.resume:
             self.carry = env.reset()
-        self.patience = patience_left(self.rows, cfg.eval.patience)
+        self.levelled_off = has_levelled_off(self.rows, cfg.eval.patience)
         self.is_over = not self.goes_on and (self.folder / "summary.json").exists()
         if rank() == 0 and not self.is_over:
             for name in ("summary.json", "failure.pt"):  # of the run before it was made longer, or went on
@@ -132,7 +132,7 @@ class Run:
     @property
     def goes_on(self) -> bool:
         """Whether there are steps left, and a reason to fly them."""
-        return self.steps < self.total_steps and self.patience > 0
+        return self.steps < self.total_steps and not self.levelled_off
 
     def __iter__(self) -> Iterator[int]:
         if self.is_over:
@@ -169,13 +169,13 @@ class Run:
                         metrics = self._evaluate()
                         solved = metrics["eval/solved"]
                         bar.set_postfix_str(f"return {metrics['eval/return']:.2f}, solved {solved:.0%}")
-                        self.patience = patience_left(self.rows, self.cfg.eval.patience)
-                    self.patience = of_first(self.patience)
+                        self.levelled_off = has_levelled_off(self.rows, self.cfg.eval.patience)
+                    self.levelled_off = of_first(self.levelled_off)
                     self.recorded.clear()
                     self.starts.clear()
                     self._save(self.folder / "checkpoint.pt")
         if rank() == 0:
-            if self.patience == 0:
+            if self.levelled_off:
                 print(f"Stopped before total_steps: no evaluation has risen since step {last_rise(self.rows):,}.")
             self._finish()
             print(f"{time.perf_counter() - began:.0f} s in all, {self.seconds:.0f} s of them training.")

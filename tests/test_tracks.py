@@ -70,6 +70,29 @@ def test_the_reward_of_a_gate_with_a_direction_is_how_fast_the_way_around_into_i
         torch.testing.assert_close(led[:, 0], torch.full_like(led[:, 0], lead))
 
 
+def test_a_drone_that_could_hardly_stop_before_the_box_pays_and_the_cost_pushes_it_inwards():
+    gates = [[-2, 0, 3], [2, 0, 3]]  # the box ends at x = -6 and 6, y = -4 and 4, z = 0 and 7
+    env = RacingEnv(num_envs=5, track={"gates": gates}, weights={"box": 0.5}, dtype=torch.float64)
+    state = dict(env.reset()["state"].items())
+    position = [
+        [4, 0, 3],
+        [4, 0, 3],
+        [4, 0, 3],
+        [5, 3, 3],
+        [0, 0, 0],
+    ]  # the last is on the floor, where nothing blows up
+    velocity = [[10, 0, 0], [-10, 0, 0], [7, 0, 0], [10, 10, 0], [0, 0, -1]]
+    state |= {"position": torch.tensor(position).double().requires_grad_(), "velocity": torch.tensor(velocity).double()}
+    cost = env.reward_terms(state)["box"].flatten()
+    expected = [math.log(25 / 15), 0.0, 0.0, 2 * math.log(50 / 15), 0.0]  # v^2 / (2 d) of 25, 6.25, 12.25, 50 and 10
+    torch.testing.assert_close(cost, -0.5 * torch.tensor(expected).double())
+    (push,) = torch.autograd.grad(cost.sum(), state["position"])
+    torch.testing.assert_close(push[3], torch.tensor([-0.5, -0.5, 0.0]).double())
+    assert push[0, 0] < 0.0 and not push[[1, 2, 4]].any()
+    assert "box" in RacingEnv(track={"gates": BOTH_WAYS, **OPEN}).reset()["reward_terms"]
+    assert "box" not in RacingEnv(track={"gates": gates}).reset()["reward_terms"]
+
+
 def test_touching_a_frame_is_a_crash_from_wherever_it_comes():
     position = torch.tensor([[-0.1, 0, 3], [-0.1, 1.05, 3], [0, 0, 3.9], [-0.1, 2, 3], [-0.1, 0, 3.4], [0.5, 1.1, 3]])
     velocity = torch.tensor([[10.0, 0, 0], [10, 0, 0], [0, 0, -10], [10, 0, 0], [10, 0, 0], [0, 10, 0]])
@@ -80,6 +103,7 @@ def test_touching_a_frame_is_a_crash_from_wherever_it_comes():
         assert 0.1 < env.drone_radius < 0.35  # so that 0.1 m from an edge is too near, and 0.5 m is not
         assert ends["crash"].flatten().tolist() == [bool(frame) and x for x in touching]
         assert ends["crash"].equal(ends["terminated"])
+        assert (ends["reward_terms", "gate"].flatten()[2] < 0.0) == bool(frame)  # before the plane, a miss all the same
 
 
 def test_an_open_track_ends_at_its_last_gate_and_times_the_way_from_the_first():

@@ -132,6 +132,15 @@ class Run:
                 OmegaConf.save(cfg, path, resolve=True)
 
     @property
+    def is_due(self) -> bool:
+        """Whether it is time for an evaluation; with ``eval.patience`` they also wait for 2 % more iterations."""
+        if self.cfg.eval.patience is not None and self.iteration < 1.02 * (
+            self.rows[-1]["iteration"] if self.rows else 0
+        ):
+            return False
+        return self.iteration % self.cfg.eval.interval == 0
+
+    @property
     def goes_on(self) -> bool:
         """Whether there are steps left, and a reason to fly them."""
         return self.steps < self.total_steps and not self.levelled_off
@@ -166,7 +175,7 @@ class Run:
                 self.iteration += 1
                 self.steps += self.horizon * self.drones
                 bar.update(self.horizon * self.drones)
-                if self.iteration % self.cfg.eval.interval == 0 or self.steps >= self.total_steps:
+                if self.is_due or self.steps >= self.total_steps:
                     best = None
                     if rank() == 0:
                         metrics = self._evaluate()

@@ -73,8 +73,8 @@ class Run:
     Every ``eval.interval`` iterations the run writes a row of metrics and a checkpoint, which holds all that it needs
     to continue bit for bit, and the best policy so far: the one that solved most episodes in an evaluation, and of
     those the one with the greatest return. At the end that policy flies from other starts. With ``eval.patience``, a
-    run that solves less than half of what this policy solved goes back to it, with its critics and optimisers, at half
-    the actor's rate.
+    run that solves less than three quarters of what this policy solved goes back to it, with its critics and
+    optimisers, at half the actor's rate.
 
     The seconds are those of the loop, without set-up, compilation, evaluations and checkpoints.
 
@@ -182,7 +182,7 @@ class Run:
                         solved = metrics["eval/solved"]
                         bar.set_postfix_str(f"return {metrics['eval/return']:.2f}, solved {solved:.0%}")
                         self.levelled_off = has_levelled_off(self.rows, self.cfg.eval.patience)
-                        if 0.5 <= self.best["solved"] > 2.0 * solved:
+                        if self.best["solved"] >= 0.5 and solved < 0.75 * self.best["solved"]:
                             best = self.best.get("stateful")
                     self.levelled_off, best = of_first((self.levelled_off, best))
                     if best is not None:

@@ -74,8 +74,8 @@ class Run:
     Every ``eval.interval`` iterations the run writes a row of metrics and a checkpoint, which holds all that it needs
     to continue bit for bit, and the best policy so far: the one that solved most episodes in an evaluation, and of
     those the one with the greatest return. At the end that policy flies from other starts. With ``eval.patience``, a
-    run that solves less than two thirds of what this policy solved goes back to it, with its critics and optimisers, at
-    half the actor's rate, down to a sixteenth.
+    run that solves less than two thirds of what this policy solved goes back to it, with its critics and optimisers;
+    each further time at half the actor's rate, down to a sixteenth.
 
     The seconds are those of the loop, without set-up, compilation, evaluations and checkpoints.
 
@@ -297,13 +297,12 @@ class Run:
         return metrics
 
     def _roll_back(self, stateful: list[dict[str, Any]]) -> None:
-        """Go back to the best policy with its critics and optimisers, from fresh starts, at half the actor's rate."""
-        for x, state in zip(self.stateful, copy.deepcopy(stateful), strict=True):
-            share = x.param_groups[0].get("share", 1.0) if isinstance(x, Optimizer) else 1.0
-            x.load_state_dict(state)
+        """Go back to the best policy with its critics and optimisers, from fresh starts."""
+        for x, state in zip(self.stateful, stateful, strict=True):
+            x.load_state_dict(copy.deepcopy(state))
             if isinstance(x, Optimizer) and x.name == "actor":
-                for group in x.param_groups:
-                    group["share"] = max(share / 2, 1 / 16)
+                for group in state["param_groups"]:  # for the next time
+                    group["share"] = max(group.get("share", 1.0) / 2, 1 / 16)
         self.actor.load_state_dict(
             self.flown.state_dict()
         )  # the weights of which the best one was the mean may be poor

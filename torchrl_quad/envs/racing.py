@@ -26,7 +26,6 @@ WEIGHTS = {  # of the reward's terms, by reward
     "position": {**terms.TARGET_WEIGHTS, "gate": 20.0},
     "velocity": {"towards": 0.02, "across": 0.02, "angular_velocity": 0.001, "gate": 5.0},
 }
-CLOSING_WEIGHT = 0.5  # of flying too fast towards where a drone crashes, where gates have a direction
 RELAXATION_WEIGHTS = {"log": {"gate": 5.0}, "reciprocal": {"gate": 1.0}}
 GATES, ROTATIONS = ("track", "gates"), ("track", "rotations")  # in the state, where each episode has another track
 FirstGate = Annotated[int, between(0, 999)]
@@ -157,7 +156,7 @@ class RacingEnv(QuadrotorEnv):
         self.ends_on_success = not self.is_closed
         self.start_range = self.track.get("start_range", self.start_range)
         self.weights = {**WEIGHTS[reward], **RELAXATION_WEIGHTS.get(gate_bonus, {})}
-        self.weights["closing"] = 0.0 if "gate_radius" in self.track else CLOSING_WEIGHT
+        self.weights["closing"] = 0.0 if "gate_radius" in self.track else 0.5
         if "scene" in self.track and kwargs.get("scene") is None:
             kwargs["scene"] = self.track["scene"]
         super().__init__(num_envs, max_episode_steps=max_episode_steps, **kwargs)

@@ -383,8 +383,8 @@ class RacingEnv(QuadrotorEnv):
             room, speed = self.half_box - torch.where(velocity > 0.0, place, -place), velocity
             if self.scene is not None:
                 distance, away = self.scene.nearest(world)
-                towards = -(away * velocity).sum(-1, keepdim=True)
-                room, speed = torch.cat((room, distance), -1), torch.cat((speed, towards.clamp_min(0.0)), -1)
+                closing = -(away * velocity).sum(-1, keepdim=True)
+                room, speed = torch.cat((room, distance), -1), torch.cat((speed, closing.clamp_min(0.0)), -1)
             needed = speed.square() / (2.0 * BRAKING * room.clamp_min(LEAST_ROOM))
             rewards["closing"] = -self.weights["closing"] * needed.clamp_min(1.0).log().sum(-1, keepdim=True)
         if self.gate_bonus != "binary":

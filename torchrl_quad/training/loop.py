@@ -73,8 +73,8 @@ class Run:
     Every ``eval.interval`` iterations the run writes a row of metrics and a checkpoint, which holds all that it needs
     to continue bit for bit, and the best policy so far: the one that solved most episodes in an evaluation, and of
     those the one with the greatest return. At the end that policy flies from other starts. With ``eval.patience``, a
-    run that solves less than three quarters of what this policy solved goes back to it, with its critics and
-    optimisers, at half the actor's rate.
+    run that solves less than two thirds of what this policy solved goes back to it, with its critics and optimisers, at
+    half the actor's rate, down to a sixteenth.
 
     The seconds are those of the loop, without set-up, compilation, evaluations and checkpoints.
 
@@ -182,7 +182,7 @@ class Run:
                         solved = metrics["eval/solved"]
                         bar.set_postfix_str(f"return {metrics['eval/return']:.2f}, solved {solved:.0%}")
                         self.levelled_off = has_levelled_off(self.rows, self.cfg.eval.patience)
-                        if self.best["solved"] >= 0.5 and solved < 0.75 * self.best["solved"]:
+                        if 0.5 <= self.best["solved"] > 1.5 * solved:
                             best = self.best.get("stateful")
                     self.levelled_off, best = of_first((self.levelled_off, best))
                     if best is not None:
@@ -294,13 +294,16 @@ class Run:
         return metrics
 
     def _roll_back(self, stateful: list[dict[str, Any]]) -> None:
-        """Go back to the best policy with all that belonged to it, from fresh starts, at half the rate of the actor."""
+        """Go back to the best policy with its critics and optimisers, from fresh starts, at half the actor's rate."""
         for x, state in zip(self.stateful, copy.deepcopy(stateful), strict=True):
             share = x.param_groups[0].get("share", 1.0) if isinstance(x, Optimizer) else 1.0
             x.load_state_dict(state)
             if isinstance(x, Optimizer) and x.name == "actor":
                 for group in x.param_groups:
-                    group["share"] = share / 2
+                    group["share"] = max(share / 2, 1 / 16)
+        self.actor.load_state_dict(
+            self.flown.state_dict()
+        )  # the weights of which the best one was the mean may be poor
         self.carry = self.env.reset()
 
     def _diagnose(self) -> dict[str, float]:

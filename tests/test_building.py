@@ -24,7 +24,7 @@ from torchrl_quad.training.building import (
     minibatches,
     shuffled,
 )
-from torchrl_quad.training.evaluation import has_levelled_off, last_rise
+from torchrl_quad.training.evaluation import has_levelled_off, last_rise, looks_ahead
 from torchrl_quad.training.loop import backward
 
 
@@ -118,6 +118,12 @@ def test_a_run_levels_off_when_no_evaluation_has_risen_for_a_share_of_it():
     assert [has_levelled_off(curve, x) for x in (None, 0.61, 0.59, 0.5)] == [False, False, True, True]
     assert not has_levelled_off(curve[:9], 0.5)  # too few evaluations to say
     assert not has_levelled_off([row | {"eval/solved": 0.4} for row in curve], 0.5)  # the task is not solved
+    low = [row | {"eval/solved": 0.4} for row in curve]
+    assert [looks_ahead(rows, 0.5) for rows in ([], low[:9], low, curve[:1], low[1:] + curve[-1:])] == [
+        *(False, False, True, True, True)
+    ]
+    higher = [{"steps": x, "eval/return": x, "eval/solved": 0.0} for x in range(101, 131)]
+    assert not has_levelled_off(low + higher, 0.5, solved=0.0) and looks_ahead(low + higher, 0.5)  # it stays so
     curve[7]["eval/solved"] = 0.52
     assert last_rise(curve) == 80 and last_rise([*curve, curve[-1] | {"eval/return": float("nan")}]) == 80
 

@@ -72,20 +72,23 @@ def last_rise(rows: Sequence[Mapping[str, float]]) -> int:
     return rose
 
 
-def half_solved(rows: Sequence[Mapping[str, float]]) -> bool:
-    """Whether an evaluation of a run has solved half of its episodes."""
-    return any(row["eval/solved"] >= 0.5 for row in rows)
-
-
-def has_levelled_off(rows: Sequence[Mapping[str, float]], patience: float | None, least: int = 10) -> bool:
+def has_levelled_off(
+    rows: Sequence[Mapping[str, float]], patience: float | None, solved: float = 0.5, least: int = 10
+) -> bool:
     """Whether no evaluation of a run has risen for a share ``patience`` of it; never where that is None.
 
-    A run of fewer than ``least`` evaluations goes on, and so does one that is not :func:`half_solved`, since returns
-    stay level for long before the first episodes are solved.
+    A run of fewer than ``least`` evaluations goes on, and so does one that has not solved a share ``solved`` of an
+    evaluation's episodes, since returns stay level for long before the first are solved.
     """
-    if patience is None or len(rows) < least or not half_solved(rows):
+    if patience is None or len(rows) < least or max(row["eval/solved"] for row in rows) < solved:
         return False
     return last_rise(rows) <= (1.0 - patience) * rows[-1]["steps"]
+
+
+def looks_ahead(rows: Sequence[Mapping[str, float]], patience: float | None) -> bool:
+    """Whether an evaluation of a run has solved half of its episodes, or the run has once levelled off without."""
+    seen = [has_levelled_off(rows[:n], patience, solved=0.0) for n in range(len(rows) + 1)]
+    return any(seen) or any(row["eval/solved"] >= 0.5 for row in rows)
 
 
 @contextlib.contextmanager

@@ -119,11 +119,15 @@ def test_a_run_levels_off_when_no_evaluation_has_risen_for_a_share_of_it():
     assert not has_levelled_off(curve[:9], 0.5)  # too few evaluations to say
     assert not has_levelled_off([row | {"eval/solved": 0.4} for row in curve], 0.5)  # the task is not solved
     low = [row | {"eval/solved": 0.4} for row in curve]
-    assert [looks_ahead(rows, 0.5) for rows in ([], low[:9], low, curve[:1], low[1:] + curve[-1:])] == [
-        *(False, False, True, True, True)
+    later = [row | {"steps": 110.0} for row in low[-1:]] * 20
+    assert [looks_ahead(rows, 1.0) for rows in ([], curve[:9], curve, low, low + later)] == [
+        *[False] * 2,
+        True,
+        False,
+        True,
     ]
-    higher = [{"steps": x, "eval/return": x, "eval/solved": 0.0} for x in range(101, 131)]
-    assert not has_levelled_off(low + higher, 0.5, solved=0.0) and looks_ahead(low + higher, 0.5)  # it stays so
+    assert looks_ahead(curve + [{"steps": 110.0, "eval/return": 200.0, "eval/solved": 0.0}], 1.0)  # it stays so
+    assert not looks_ahead(low + later, None)
     curve[7]["eval/solved"] = 0.52
     assert last_rise(curve) == 80 and last_rise([*curve, curve[-1] | {"eval/return": float("nan")}]) == 80
 

@@ -86,9 +86,10 @@ def has_levelled_off(
 
 
 def looks_ahead(rows: Sequence[Mapping[str, float]], patience: float | None) -> bool:
-    """Whether an evaluation of a run has solved half of its episodes, or the run has once levelled off without."""
-    seen = [has_levelled_off(rows[:n], patience, solved=0.0) for n in range(len(rows) + 1)]
-    return any(seen) or any(row["eval/solved"] >= 0.5 for row in rows)
+    """Whether a run has once levelled off, for half of its patience; unsolved, after 30 evaluations at the earliest."""
+    half = None if patience is None else 0.5 * patience
+    seen = [rows[:n] for n in range(len(rows) + 1)]
+    return any(has_levelled_off(x, half) or has_levelled_off(x, half, solved=0.0, least=30) for x in seen)
 
 
 @contextlib.contextmanager

@@ -88,8 +88,8 @@ class Run:
     Attributes:
         carry: where the next horizon starts; the algorithm sets it in each iteration.
         horizon: control steps of this iteration's rollout, ``cfg.horizon`` unless the algorithm sets it.
-        looks_ahead: whether an evaluation has solved half of its episodes, or the run has once levelled off without.
         levelled_off: whether its evaluations have, by ``eval.patience``; then it ends.
+        looks_ahead: whether they have once, for half of the patience; a recipe may then look further ahead.
     """
 
     def __init__(

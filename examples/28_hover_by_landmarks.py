@@ -20,7 +20,11 @@ LESSONS, ITERATIONS = 150, 150
 STATE = [("state", name) for name in ("position", "velocity", "quaternion", "angular_velocity")]
 
 
-def pretrain(env, actor):
+env = Features(num_envs=64, seed=0)
+env.compile()
+
+
+def pretrain(actor):
     """Let the memory tell position, velocity and the direction of up, in flights of the untrained policy."""
     features, memory, _ = actor[0].module
     tell = torch.nn.LazyLinear(9)
@@ -42,10 +46,10 @@ def pretrain(env, actor):
 def train(pretrained):
     """The median distance to the target [cm] of a policy that has learned by AHAC."""
     torch.manual_seed(0)
-    env = Features(num_envs=64, seed=0)
+    env.set_seed(0)
     actor = make_actor(env, recurrent=True, scale_init=0.2, learn_scale=False, noise_correlation=0.9)
     if pretrained:
-        pretrain(env, actor)
+        pretrain(actor)
     loss = AHACLoss(actor, make_value(env, in_keys=STATE), clip_action_gradient=2.0)
     actor_optimizer = torch.optim.Adam(loss.actor_network_params.parameters(), 1e-2, betas=(0.7, 0.95))
     critic_optimizer = torch.optim.Adam(loss.value_network_params.parameters(), 5e-3)

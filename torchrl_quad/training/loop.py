@@ -54,9 +54,9 @@ from torchrl_quad.training.evaluation import (
     drawing_from,
     evaluate,
     final_evaluation,
-    half_solved,
     has_levelled_off,
     last_rise,
+    looks_ahead,
     print_summary,
     rounds,
     title,
@@ -88,8 +88,8 @@ class Run:
     Attributes:
         carry: where the next horizon starts; the algorithm sets it in each iteration.
         horizon: control steps of this iteration's rollout, ``cfg.horizon`` unless the algorithm sets it.
-        half_solved: whether an evaluation has solved half of its episodes.
         levelled_off: whether its evaluations have, by ``eval.patience``; then it ends.
+        looks_ahead: whether they have once, for half of the patience; a recipe may then look further ahead.
     """
 
     def __init__(
@@ -124,7 +124,8 @@ class Run:
         logger_state = self._load(Path(cfg.resume)) if cfg.resume else None
         if not cfg.resume:
             self.carry = env.reset()
-        self.half_solved, self.levelled_off = half_solved(self.rows), has_levelled_off(self.rows, cfg.eval.patience)
+        self.looks_ahead = looks_ahead(self.rows, cfg.eval.patience)
+        self.levelled_off = has_levelled_off(self.rows, cfg.eval.patience)
         self.is_over = not self.goes_on and (self.folder / "summary.json").exists()
         if rank() == 0 and not self.is_over:
             for name in ("summary.json", "failure.pt"):  # of the run before it was made longer, or went on
@@ -183,11 +184,11 @@ class Run:
                         metrics = self._evaluate()
                         solved = metrics["eval/solved"]
                         bar.set_postfix_str(f"return {metrics['eval/return']:.2f}, solved {solved:.0%}")
-                        self.half_solved = half_solved(self.rows)
+                        self.looks_ahead = looks_ahead(self.rows, self.cfg.eval.patience)
                         self.levelled_off = has_levelled_off(self.rows, self.cfg.eval.patience)
                         if 0.5 <= self.best["solved"] > 1.5 * solved:
                             best = self.best.get("stateful")
-                    self.half_solved, self.levelled_off, best = of_first((self.half_solved, self.levelled_off, best))
+                    self.looks_ahead, self.levelled_off, best = of_first((self.looks_ahead, self.levelled_off, best))
                     if best is not None:
                         self._roll_back(best)
                     self.recorded.clear()

@@ -1,4 +1,4 @@
-"""The recipe for every task: AHAC with one set of numbers; rates, scales, horizon and end follow from the run.
+"""The recipe for every task: AHAC with one set of numbers; scale, discount, horizon and end follow from the run.
 
 python recipes/train.py task=hovering seed=0
 """
@@ -26,6 +26,8 @@ def main(cfg: DictConfig) -> None:
     scale = ReturnScale(loss)
     run = Run(cfg, env, actor, loss, [actor_optimizer, critic_optimizer, scale])
     for _ in run:
+        # Until returns level off for the first time, the discount looks half as far ahead.
+        loss.value_estimator.gamma.fill_(cfg.gamma if run.looks_ahead else 2.0 * cfg.gamma - 1.0)
         run.horizon = loss.horizon
         # The actor: up the return of one horizon and the value of its end, through the dynamics.
         rollout, end = differentiable_rollout(env, actor, run.carry, run.horizon)

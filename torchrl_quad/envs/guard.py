@@ -121,7 +121,7 @@ class Containment:
 
 def is_true(flags: Tensor) -> bool:
     """Whether all flags are set, where reading them needs no device synchronisation; False elsewhere."""
-    return looks_are_free(flags.device) and not is_traced() and bool(flags.all())
+    return not is_traced() and looks_are_free(flags.device) and bool(flags.all())
 
 
 def read_state(state: Any, safe_state: State, source: str, convert: bool = False) -> State:

@@ -26,7 +26,6 @@ WEIGHTS = {  # of the reward's terms, by reward
     "position": {**terms.TARGET_WEIGHTS, "gate": 20.0},
     "velocity": {"towards": 0.02, "across": 0.02, "angular_velocity": 0.001, "gate": 5.0},
 }
-BOX_WEIGHT = 0.5  # of flying too fast towards a side of the box, where gates have a direction
 RELAXATION_WEIGHTS = {"log": {"gate": 5.0}, "reciprocal": {"gate": 1.0}}
 GATES, ROTATIONS = ("track", "gates"), ("track", "rotations")  # in the state, where each episode has another track
 FirstGate = Annotated[int, between(0, 999)]
@@ -34,7 +33,7 @@ START_ROOM = 0.05  # [m], to the sides of the box, at least
 FUNNEL = 0.5  # how far before a gate the reward leads, as a share of the way to the axis of the gate
 ROUND = 0.1  # [m], from the axis, where the way to it is rounded off
 SLOW = 1.0  # [m/s], towards a gate: slower drones are led back before its plane, since they would hang at it
-BRAKING, LEAST_ROOM = 15.0, 0.05  # [m/s2], what costs nothing; [m], below which a side of the box gets no nearer
+BRAKING, LEAST_ROOM = 15.0, 0.05  # [m/s2], what costs nothing; [m], below which nothing gets nearer
 SAMPLES = 8  # of the way of a step, on which it may touch the frame of a gate
 
 
@@ -64,9 +63,9 @@ class RacingEnv(QuadrotorEnv):
     distance from the axis, and by the drone's way beyond the gate, which for a drone slower than 1 m/s begins up to
     half of the smallest opening before the gate; v_t is how fast the way over that point gets shorter. A step that
     crosses the plane of the gate elsewhere, or touches a frame, takes up to a bonus away, tanh(m) of it at m [m] from
-    half of the opening. A drone pays 0.5 log(a / 15) for each side of the box ahead that takes more than 15 m/s2 to
-    stop before, a = v^2 / (2 d) with the speed v towards it and the distance d: that it would crash there has no
-    gradient. ``weights={"box": 0.5}`` does so with spheres, too.
+    half of the opening. A drone pays 0.5 log(a / 15) for each side of the box ahead, and for the nearest obstacle, that
+    takes a > 15 m/s2 to stop before, a = v^2 / (2 d) with the speed v towards it and the distance d: that it would
+    crash there has no gradient. ``weights={"closing": 0.5}`` does so with spheres, too.
 
     A gate that is a point is passed when the straight line that the drone flew in a control step comes within 0.3 m of
     it. A gate with a direction is passed when that line crosses its plane, from behind, within its opening. The reward
@@ -157,7 +156,7 @@ class RacingEnv(QuadrotorEnv):
         self.ends_on_success = not self.is_closed
         self.start_range = self.track.get("start_range", self.start_range)
         self.weights = {**WEIGHTS[reward], **RELAXATION_WEIGHTS.get(gate_bonus, {})}
-        self.weights["box"] = 0.0 if "gate_radius" in self.track else BOX_WEIGHT
+        self.weights["closing"] = 0.0 if "gate_radius" in self.track else 0.5
         if "scene" in self.track and kwargs.get("scene") is None:
             kwargs["scene"] = self.track["scene"]
         super().__init__(num_envs, max_episode_steps=max_episode_steps, **kwargs)
@@ -379,11 +378,15 @@ class RacingEnv(QuadrotorEnv):
                 "across": -self.weights["across"] * across / (gap + 1.0),
                 "angular_velocity": -self.weights["angular_velocity"] * terms.norm(state["angular_velocity"]),
             }
-        if self.weights["box"]:
+        if self.weights["closing"]:
             place, velocity = world["position"] - self.centre, world["velocity"]
-            room = (self.half_box - torch.where(velocity > 0.0, place, -place)).clamp_min(LEAST_ROOM)  # ahead
-            needed = velocity.square() / (2.0 * BRAKING * room)
-            rewards["box"] = -self.weights["box"] * needed.clamp_min(1.0).log().sum(-1, keepdim=True)
+            room, speed = self.half_box - torch.where(velocity > 0.0, place, -place), velocity
+            if self.scene is not None:
+                distance, away = self.scene.nearest(world)
+                closing = -(away * velocity).sum(-1, keepdim=True)
+                room, speed = torch.cat((room, distance), -1), torch.cat((speed, closing.clamp_min(0.0)), -1)
+            needed = speed.square() / (2.0 * BRAKING * room.clamp_min(LEAST_ROOM))
+            rewards["closing"] = -self.weights["closing"] * needed.clamp_min(1.0).log().sum(-1, keepdim=True)
         if self.gate_bonus != "binary":
             bonus = -torch.log(gap + 0.01) if self.gate_bonus == "log" else 1.0 / (gap + 0.05)
         return {**rewards, "gate": self.weights["gate"] * bonus}

@@ -56,6 +56,7 @@ from torchrl_quad.training.evaluation import (
     final_evaluation,
     has_levelled_off,
     last_rise,
+    looks_ahead,
     print_summary,
     rounds,
     title,
@@ -73,8 +74,8 @@ class Run:
     Every ``eval.interval`` iterations the run writes a row of metrics and a checkpoint, which holds all that it needs
     to continue bit for bit, and the best policy so far: the one that solved most episodes in an evaluation, and of
     those the one with the greatest return. At the end that policy flies from other starts. With ``eval.patience``, a
-    run that solves less than half of what this policy solved goes back to it, with its critics and optimisers, at half
-    the actor's rate.
+    run that solves less than two thirds of what this policy solved goes back to it, with its critics and optimisers;
+    each further time at half the actor's rate, down to a sixteenth.
 
     The seconds are those of the loop, without set-up, compilation, evaluations and checkpoints.
 
@@ -88,6 +89,7 @@ class Run:
         carry: where the next horizon starts; the algorithm sets it in each iteration.
         horizon: control steps of this iteration's rollout, ``cfg.horizon`` unless the algorithm sets it.
         levelled_off: whether its evaluations have, by ``eval.patience``; then it ends.
+        looks_ahead: whether they have once, for half of the patience; a recipe may then look further ahead.
     """
 
     def __init__(
@@ -122,6 +124,7 @@ class Run:
         logger_state = self._load(Path(cfg.resume)) if cfg.resume else None
         if not cfg.resume:
             self.carry = env.reset()
+        self.looks_ahead = looks_ahead(self.rows, cfg.eval.patience)
         self.levelled_off = has_levelled_off(self.rows, cfg.eval.patience)
         self.is_over = not self.goes_on and (self.folder / "summary.json").exists()
         if rank() == 0 and not self.is_over:
@@ -130,6 +133,15 @@ class Run:
             self.logs = Logs(self, logger_state)
             with replacing(self.folder / "config.yaml") as path:
                 OmegaConf.save(cfg, path, resolve=True)
+
+    @property
+    def is_due(self) -> bool:
+        """Whether it is time for an evaluation; with ``eval.patience`` they also wait for 2 % more iterations."""
+        if self.cfg.eval.patience is not None and self.iteration < 1.02 * (
+            self.rows[-1]["iteration"] if self.rows else 0
+        ):
+            return False
+        return self.iteration % self.cfg.eval.interval == 0
 
     @property
     def goes_on(self) -> bool:
@@ -166,16 +178,17 @@ class Run:
                 self.iteration += 1
                 self.steps += self.horizon * self.drones
                 bar.update(self.horizon * self.drones)
-                if self.iteration % self.cfg.eval.interval == 0 or self.steps >= self.total_steps:
+                if self.is_due or self.steps >= self.total_steps:
                     best = None
                     if rank() == 0:
                         metrics = self._evaluate()
                         solved = metrics["eval/solved"]
                         bar.set_postfix_str(f"return {metrics['eval/return']:.2f}, solved {solved:.0%}")
+                        self.looks_ahead = looks_ahead(self.rows, self.cfg.eval.patience)
                         self.levelled_off = has_levelled_off(self.rows, self.cfg.eval.patience)
-                        if 0.5 <= self.best["solved"] > 2.0 * solved:
+                        if 0.5 <= self.best["solved"] > 1.5 * solved:
                             best = self.best.get("stateful")
-                    self.levelled_off, best = of_first((self.levelled_off, best))
+                    self.looks_ahead, self.levelled_off, best = of_first((self.looks_ahead, self.levelled_off, best))
                     if best is not None:
                         self._roll_back(best)
                     self.recorded.clear()
@@ -285,13 +298,15 @@ class Run:
         return metrics
 
     def _roll_back(self, stateful: list[dict[str, Any]]) -> None:
-        """Go back to the best policy with all that belonged to it, from fresh starts, at half the rate of the actor."""
-        for x, state in zip(self.stateful, copy.deepcopy(stateful), strict=True):
-            share = x.param_groups[0].get("share", 1.0) if isinstance(x, Optimizer) else 1.0
-            x.load_state_dict(state)
+        """Go back to the best policy with its critics and optimisers, from fresh starts."""
+        for x, state in zip(self.stateful, stateful, strict=True):
+            x.load_state_dict(copy.deepcopy(state))
             if isinstance(x, Optimizer) and x.name == "actor":
-                for group in x.param_groups:
-                    group["share"] = share / 2
+                for group in state["param_groups"]:  # for the next time
+                    group["share"] = max(group.get("share", 1.0) / 2, 1 / 16)
+        self.actor.load_state_dict(
+            self.flown.state_dict()
+        )  # the weights of which the best one was the mean may be poor
         self.carry = self.env.reset()
 
     def _diagnose(self) -> dict[str, float]:

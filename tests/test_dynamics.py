@@ -379,7 +379,9 @@ def test_with_respect_to_every_entry_of_the_initial_state_also_through_resets():
     state["step"] = torch.tensor([[15], [0], [19]])  # the second drone flies through
     actions = actions.detach()
     values = {key: x.clone().requires_grad_() for key, x in state.items() if x.is_floating_point()}
-    assert gradients_agree(lambda *x: flight(env, actions, state.copy().update(dict(zip(values, x)))), *values.values())
+    assert gradients_agree(
+        lambda *x: flight(env, actions, state.copy().update(dict(zip(values, x, strict=True)))), *values.values()
+    )
 
 
 @pytest.mark.parametrize(("limit", "lag"), [(256, [0.03, 0.05]), (12, 0.033)])  # at rest two constants have a kink

@@ -19,13 +19,12 @@ from torchrl_quad.training import building
 from torchrl_quad.training.building import (
     AdaptiveOptimizer,
     Optimizer,
-    PatientOptimizer,
     ReturnScale,
     TargetUpdate,
     minibatches,
     shuffled,
 )
-from torchrl_quad.training.evaluation import last_rise, patience_left
+from torchrl_quad.training.evaluation import has_levelled_off, last_rise, looks_ahead
 from torchrl_quad.training.loop import backward
 
 
@@ -81,15 +80,12 @@ def test_a_schedule_goes_from_the_first_to_the_last_learning_rate(schedule, half
         assert adam.param_groups[0]["lr"] == pytest.approx(rate)
 
 
-def test_in_a_run_of_any_length_the_limit_falls_with_the_patience_and_the_first_rate_is_the_greatest():
-    adam = optimizer(10, PatientOptimizer, max_kl=8.0)
-    adam.anneal(9)
-    assert [adam.limit_to(patience) for patience in (0.0, 0.5, 1.0)] == pytest.approx([0.16, 4.0, 8.0])
-    rates = []
-    for moved in (0.0, 9.0, 5.0, 0.0, 0.0):
-        adam.adapt(moved)
-        rates.append(adam.param_groups[0]["lr"])
-    assert rates == pytest.approx([1e-2, 1e-2 / 1.5, 1e-2 / 1.5, 1e-2, 1e-2])
+def test_the_inverse_square_root_of_the_iteration_is_the_same_rate_in_runs_of_every_length():
+    for length in (301, 5000):
+        adam = optimizer(length, schedule="inverse_sqrt")
+        for iteration, rate in ((0, 1e-2), (50, 1e-2), (200, 5e-3), (300, 1e-2 / 6**0.5)):
+            adam.anneal(iteration)
+            assert adam.param_groups[0]["lr"] == pytest.approx(rate)
 
 
 @pytest.mark.parametrize("unit", [1.0, 1000.0])
@@ -115,13 +111,23 @@ def test_rewards_in_any_unit_are_divided_by_the_size_of_returns_and_critics_keep
     assert scale.value.item() == pytest.approx(unit * ((16 + 4) / 2) ** 0.5, rel=1e-6)
 
 
-def test_patience_with_a_run_falls_while_no_evaluation_rises():
+def test_a_run_levels_off_when_no_evaluation_has_risen_for_a_share_of_it():
     returns = [-10.0, 90.0, 90.9, 91.1, 91.9, *[92.0] * 5]  # a rise is 1 % of the range, 1: at the fourth step
     curve = [{"steps": 10 * i, "eval/return": x, "eval/solved": 0.5} for i, x in enumerate(returns, 1)]
     assert [last_rise(curve[:n]) for n in range(1, 11)] == [10, 20, 20, 40, 40, 40, 40, 40, 40, 40]
-    assert [patience_left(curve, x) for x in (None, 0.8, 0.6, 0.5)] == [1.0, pytest.approx(0.25), 0.0, 0.0]
-    assert patience_left(curve[:9], 0.5) == 1.0  # too few evaluations to say
-    assert patience_left([row | {"eval/solved": 0.4} for row in curve], 0.5) == 1.0  # the task is not solved
+    assert [has_levelled_off(curve, x) for x in (None, 0.61, 0.59, 0.5)] == [False, False, True, True]
+    assert not has_levelled_off(curve[:9], 0.5)  # too few evaluations to say
+    assert not has_levelled_off([row | {"eval/solved": 0.4} for row in curve], 0.5)  # the task is not solved
+    low = [row | {"eval/solved": 0.4} for row in curve]
+    later = [row | {"steps": 110.0} for row in low[-1:]] * 20
+    assert [looks_ahead(rows, 1.0) for rows in ([], curve[:9], curve, low, low + later)] == [
+        *[False] * 2,
+        True,
+        False,
+        True,
+    ]
+    assert looks_ahead(curve + [{"steps": 110.0, "eval/return": 200.0, "eval/solved": 0.0}], 1.0)  # it stays so
+    assert not looks_ahead(low + later, None)
     curve[7]["eval/solved"] = 0.52
     assert last_rise(curve) == 80 and last_rise([*curve, curve[-1] | {"eval/return": float("nan")}]) == 80
 

@@ -21,7 +21,10 @@ REFUSED = [  # of ABPT, unless a recipe is named
     ("actor.num_cells=64", r"actor.num_cells=64: it must be a list. .* or \[64\] for one layer"),
     ("actor.activation=functional", "actor.activation=functional: it must be 'CELU', 'ELU', .* or 'Tanh'"),
     ("actor.final_lr=0 actor.schedule=exponential", "actor.final_lr=0: it must be above 0 with schedule=exponential"),
-    ("actor.schedule=step", "actor.schedule=step: it must be 'constant', 'linear', 'exponential' or 'cosine'"),
+    (
+        "actor.schedule=step",
+        "actor.schedule=step: it must be 'constant', 'linear', 'exponential', 'cosine' or 'inverse_sqrt'",
+    ),
     ("critic.updates=null", "critic.updates=null: it must be a whole number"),
     ("actor.scale_init=abc", "actor.scale_init=abc: it must be a number"),
     ("gamma=2", "gamma=2: it must be at most 1. .* 0.99 is usual"),
@@ -109,6 +112,14 @@ def test_every_configuration_that_ships_passes_the_schema_with_its_tuned_values(
     tuned = yaml.safe_load(path.read_text())
     tuned.pop("defaults", None)
     assert OmegaConf.merge(cfg, tuned) == cfg
+
+
+def test_no_tuned_reward_makes_a_crash_pay_more_than_the_way_back_to_the_target():
+    for path in TUNED:
+        if weights := (yaml.safe_load(path.read_text()).get("env") or {}).get("weights"):
+            task = TASKS[path.stem.split("_")[1]]
+            weights = {**task.weights, **weights}
+            assert weights["survival"] >= task.box_half_width * weights["position"], path.stem
 
 
 def test_recipes_pass_the_schema_on_tasks_that_they_are_not_tuned_for_and_one_has_the_same_numbers_for_all():

@@ -137,6 +137,43 @@ def test_a_run_ends_when_its_evaluation_has_levelled_off_says_so_and_goes_on_wit
     assert len(rows(tmp_path)) == 20
 
 
+def test_a_run_that_lost_a_third_of_what_it_solved_goes_back_to_its_best_policy_and_the_next_time_slower(
+    train, launch, no_pictures, tmp_path, monkeypatch
+):
+    script, saved = [0.4, 0.1, 0.84, 0.6, 0.55, 0.2, 0.9, 0.7], {}
+    save = loop.Run._save
+
+    def keep(self, path):
+        save(self, path)
+        saved[self.iteration] = read_checkpoint(path)
+        if self.folder.name == "stopped" and self.iteration == 5 and not self.cfg.resume:
+            raise KeyboardInterrupt
+
+    def evaluate(*_):
+        return {"eval/return": 1.0, "eval/solved": script[len(seen)]}, seen.append(0)
+
+    monkeypatch.setattr(loop.Run, "_save", keep)
+    monkeypatch.setattr(loop, "evaluate", evaluate)
+    options, seen = ["eval.interval=1", "eval.patience=0.9", "actor.average=0.5"], []
+    straight = train("train", tmp_path / "straight", *options)
+    shares = [saved[i]["stateful"][1]["param_groups"][0].pop("share", 1.0) for i in range(1, 9)]
+    assert shares == [1.0, 1.0, 1.0, 1.0, 1.0, 0.5, 0.5, 0.5]
+    best, policy = saved[3]["stateful"], saved[3]["best"]["actor"]
+    assert not torch.equal(policy[key := "module.0.module.mlp.0.weight"], best[0][f"actor_network_params.{key}"])
+    best[0] |= {f"actor_network_params.{name}": x for name, x in policy.items()}  # the mean, which solved so many
+    for lost in (5, 6):  # and critics, optimisers, scale, average
+        assert_equal(saved[lost]["stateful"], best)
+    assert not torch.equal(saved[4]["stateful"][3]["square"], saved[3]["stateful"][3]["square"])
+    assert saved[8]["best"]["steps"] == saved[7]["steps"]
+    seen = []
+    with pytest.raises(SystemExit):
+        train("train", tmp_path / "stopped", *options)
+    straight["stateful"] = saved[8]["stateful"]
+    resumed = train("train", tmp_path / "stopped", *options, "resume=auto")
+    assert resumed["stateful"][1]["param_groups"][0].pop("share") == 0.5
+    assert_equal(straight, resumed)
+
+
 def test_what_the_command_line_says_must_agree_with_the_checkpoint(train, refused, tmp_path):
     train("bptt", tmp_path)
     small = [*SMALL, f"hydra.run.dir={tmp_path}"]

@@ -70,6 +70,24 @@ def test_the_reward_of_a_gate_with_a_direction_is_how_fast_the_way_around_into_i
         torch.testing.assert_close(led[:, 0], torch.full_like(led[:, 0], lead))
 
 
+def test_a_drone_that_could_hardly_stop_before_a_crash_pays_and_the_cost_pushes_it_away():
+    gates = [[-2, 0, 3], [2, 0, 3]]  # the box ends at x = -6 and 6, y = -4 and 4, z = 0 and 7
+    scene = {"spheres": [{"centre": [0, -3, 3], "radius": 0.9}], "drone_radius": 0.1}
+    env = RacingEnv(num_envs=6, track={"gates": gates, "scene": scene}, weights={"closing": 0.5}, dtype=torch.float64)
+    state = dict(env.reset()["state"].items())
+    position = [[4, 0, 3], [4, 0, 3], [4, 0, 3], [5, 3, 3], [0, 0, 0], [0, 0, 3]]  # the last is 2 m before the sphere
+    velocity = [[10, 0, 0], [-10, 0, 0], [7, 0, 0], [10, 10, 0], [0, 0, -1], [0, -10, 0]]
+    braking = [25, 1, 1, 50 * 50 / 15, 1, 25]  # [m/s2], v^2 / (2 d); of two sides; 1 where it costs nothing
+    state |= {"position": torch.tensor(position).double().requires_grad_(), "velocity": torch.tensor(velocity).double()}
+    cost = env.reward_terms(state)["closing"].flatten()
+    torch.testing.assert_close(cost, -0.5 * (torch.tensor(braking).double() / 15).clamp_min(1.0).log())
+    (push,) = torch.autograd.grad(cost.sum(), state["position"])
+    torch.testing.assert_close(push[3], torch.tensor([-0.5, -0.5, 0.0]).double())
+    assert push[0, 0] < 0.0 and push[5, 1] > 0.0 and not push[[1, 2, 4]].any()
+    assert "closing" in RacingEnv(track={"gates": BOTH_WAYS, **OPEN}).reset()["reward_terms"]
+    assert "closing" not in RacingEnv(track={"gates": gates}).reset()["reward_terms"]
+
+
 def test_touching_a_frame_is_a_crash_from_wherever_it_comes():
     position = torch.tensor([[-0.1, 0, 3], [-0.1, 1.05, 3], [0, 0, 3.9], [-0.1, 2, 3], [-0.1, 0, 3.4], [0.5, 1.1, 3]])
     velocity = torch.tensor([[10.0, 0, 0], [10, 0, 0], [0, 0, -10], [10, 0, 0], [10, 0, 0], [0, 10, 0]])
@@ -80,6 +98,7 @@ def test_touching_a_frame_is_a_crash_from_wherever_it_comes():
         assert 0.1 < env.drone_radius < 0.35  # so that 0.1 m from an edge is too near, and 0.5 m is not
         assert ends["crash"].flatten().tolist() == [bool(frame) and x for x in touching]
         assert ends["crash"].equal(ends["terminated"])
+        assert (ends["reward_terms", "gate"].flatten()[2] < 0.0) == bool(frame)  # before the plane, a miss all the same
 
 
 def test_an_open_track_ends_at_its_last_gate_and_times_the_way_from_the_first():

@@ -20,6 +20,7 @@ from torchrl_quad.envs.scenes import reach_of
 from torchrl_quad.envs.track import MARGIN, Course, TrackOption, forward, load_track, starts_before
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.options import Size, between
+from torchrl_quad.vision.primitives import from_faces
 
 WEIGHTS = {  # of the reward's terms, by reward
     "position": {**terms.TARGET_WEIGHTS, "gate": 20.0},
@@ -31,9 +32,8 @@ FirstGate = Annotated[int, between(0, 999)]
 START_ROOM = 0.05  # [m], to the sides of the box, at least
 FUNNEL = 0.5  # how far before a gate the reward leads, as a share of the way to the axis of the gate
 ROUND = 0.1  # [m], from the axis, where the way to it is rounded off
-SLOW = (
-    1.0  # [m/s], towards a gate; a slower drone is led back before its plane, and not just onto it, where it would hang
-)
+SLOW = 1.0  # [m/s], towards a gate: slower drones are led back before its plane, since they would hang at it
+BRAKING, LEAST_ROOM = 15.0, 0.05  # [m/s2], what costs nothing; [m], below which nothing gets nearer
 SAMPLES = 8  # of the way of a step, on which it may touch the frame of a gate
 
 
@@ -54,14 +54,18 @@ class RacingEnv(QuadrotorEnv):
 
     Reward "velocity": 0.02 min(v_t, 15) - 0.02 |v_a| / (d + 1) - 0.001 |w|, and a gate bonus of 5, where v_t is the
     velocity towards the next gate, v_a the part of the velocity across that direction, and d the distance to the gate
-    [m]. Reward "position": that of hovering, with the next gate as its target, and a gate bonus of 20. Where gates have
-    a direction, d and v_a are about a point on the axis of the gate, before it by half of the drone's distance from the
-    axis, and by the drone's way beyond the gate, which for a drone slower than 1 m/s begins up to half of the smallest
-    opening before the gate; v_t is how fast the way over that point gets shorter. A step that
-    crosses the plane of such a gate elsewhere takes up to a bonus away, tanh(m) of it at m [m] from half of the
-    opening. The binary bonus is paid in the step that passes a gate and carries no gradient; with ``event_discount``
-    the time at which the drone enters the gate's sphere, or crosses its plane, does. Two relaxations replace the bonus
-    by one in each step: "log", -5 log(d + 0.01), and "reciprocal", 1 / (d + 0.05).
+    [m]. Reward "position": that of hovering, with the next gate as its target, and a gate bonus of 20. The binary bonus
+    is paid in the step that passes a gate and carries no gradient; with ``event_discount`` the time at which the drone
+    enters the gate's sphere, or crosses its plane, does. Two relaxations replace the bonus by one in each step: "log",
+    -5 log(d + 0.01), and "reciprocal", 1 / (d + 0.05).
+
+    Where gates have a direction, d and v_a are about a point on the axis of the gate, before it by half of the drone's
+    distance from the axis, and by the drone's way beyond the gate, which for a drone slower than 1 m/s begins up to
+    half of the smallest opening before the gate; v_t is how fast the way over that point gets shorter. A step that
+    crosses the plane of the gate elsewhere, or touches a frame, takes up to a bonus away, tanh(m) of it at m [m] from
+    half of the opening. A drone pays 0.5 log(a / 15) for each side of the box ahead, and for the nearest obstacle, that
+    takes a > 15 m/s2 to stop before, a = v^2 / (2 d) with the speed v towards it and the distance d: that it would
+    crash there has no gradient. ``weights={"closing": 0.5}`` does so with spheres, too.
 
     A gate that is a point is passed when the straight line that the drone flew in a control step comes within 0.3 m of
     it. A gate with a direction is passed when that line crosses its plane, from behind, within its opening. The reward
@@ -152,6 +156,7 @@ class RacingEnv(QuadrotorEnv):
         self.ends_on_success = not self.is_closed
         self.start_range = self.track.get("start_range", self.start_range)
         self.weights = {**WEIGHTS[reward], **RELAXATION_WEIGHTS.get(gate_bonus, {})}
+        self.weights["closing"] = 0.0 if "gate_radius" in self.track else 0.5
         if "scene" in self.track and kwargs.get("scene") is None:
             kwargs["scene"] = self.track["scene"]
         super().__init__(num_envs, max_episode_steps=max_episode_steps, **kwargs)
@@ -250,19 +255,14 @@ class RacingEnv(QuadrotorEnv):
             found = [x[0, gate[:, 0]] for x in own]
         return found[0], found[-1]
 
-    def local(self, previous: State, state: State) -> tuple[Tensor, Tensor]:
-        """Both ends of a step, each (n, 3) [m], in the frame of the gate that was next: x in its direction."""
+    def crossing(self, previous: State, state: State) -> tuple[Tensor, Tensor]:
+        """When a step crosses the plane of the gate that was next, as a fraction of the step with its gradient, (n, 1),
+        and whether it does so in its direction and within its opening, (n, 1)."""
         centre, rotation = self.pose(previous, previous["gate"])
         start, end = (quaternion.rotate_inverse(rotation, x["position"] - centre) for x in (previous, state))
-        return start, end
-
-    def crosses(self, previous: State, state: State) -> Tensor:
-        """Whether a step crosses the plane of the next gate, in its direction and within its opening, (n, 1)."""
-        start, end = self.local(previous, state)
-        behind, beyond = start[:, :1], end[:, :1]
-        off = torch.lerp(start, end, -behind / (beyond - behind).clamp_min(1e-12))[:, 1:]
-        off = _outside(off, self.openings[previous["gate"][:, 0]])
-        return (behind < 0.0) & (beyond >= 0.0) & (off < 0.0).all(-1, keepdim=True)
+        time = terms.level_crossing(-start[:, :1], -end[:, :1], 0.0)
+        off = _outside(torch.lerp(start, end, time)[:, 1:], self.openings[previous["gate"][:, 0]])
+        return time, (start[:, :1] < 0.0) & (end[:, :1] >= 0.0) & (off < 0.0).all(-1, keepdim=True)
 
     def touches(self, previous: State, state: State) -> Tensor:
         """Whether a step touches the frame of any gate, (n, 1): bars around the opening, as deep as they are wide.
@@ -276,16 +276,16 @@ class RacingEnv(QuadrotorEnv):
         crossing = (-start[..., :1] / torch.where(way[..., :1] == 0.0, 1.0, way[..., :1])).clamp(0.0, 1.0)
         share = torch.cat((share + 0.0 * crossing, crossing), -1).unsqueeze(-1)  # (n, k, instants, 1)
         along, aside = (start.unsqueeze(2) + share * way.unsqueeze(2)).split((1, 2), -1)
-        beyond = _outside(aside, self.openings.unsqueeze(1))
-        bars = torch.maximum(_box(beyond - self.frame), -beyond.amax(-1, keepdim=True))
-        distance = _box(torch.cat((bars, along.abs() - 0.5 * self.frame), -1))
+        beyond = _outside(aside, self.openings.unsqueeze(1)).unbind(-1)
+        bars = torch.maximum(from_faces(*(x - self.frame for x in beyond)), -torch.stack(beyond).amax(0))
+        distance = from_faces(bars, along.squeeze(-1).abs() - 0.5 * self.frame)
         return (distance < self.drone_radius).flatten(1).any(1, keepdim=True)
 
     def advance(self, previous: State, state: State) -> State:
         gate, step = previous["gate"], state["step"]
         with torch.no_grad():  # how close to the gate the straight line between the two positions comes
             if self.is_directed:
-                passed = self.crosses(previous, state)
+                _, passed = self.crossing(previous, state)
             else:
                 start, (centre, _) = previous["position"], self.pose(previous, gate)
                 line = state["position"] - start
@@ -316,8 +316,7 @@ class RacingEnv(QuadrotorEnv):
         if self.gate_bonus != "binary":
             return {}
         if self.is_directed:
-            start, end = self.local(previous, state)
-            time = terms.level_crossing(-start[:, :1], -end[:, :1], 0.0)
+            time, _ = self.crossing(previous, state)
         else:
             ends = previous["position"], state["position"]
             time = terms.ball_entry(*ends, previous["target"], self.gate_radius)
@@ -355,13 +354,13 @@ class RacingEnv(QuadrotorEnv):
         before = FUNNEL * (off - ROUND) + beyond.clamp_min(0.0)
         growth = FUNNEL * (aside * velocity[:, 1:]).sum(-1, keepdim=True) / off + torch.where(beyond > 0.0, speed, 0.0)
         outside = _outside(aside, 0.5 * self.openings[state["gate"][:, 0]]).amax(-1, keepdim=True).clamp_min(0.0)
-        crossed = (along >= 0.0) & (along < self.control_dt * speed) & ~state["gate_passed"]  # when another was next
-        missed = torch.where(crossed, outside.tanh(), 0.0)
+        missed = (along >= 0.0) & (along < self.control_dt * speed)
+        missed = missed | state["frame_touched"] if self.frame else missed
+        missed = torch.where(missed & ~state["gate_passed"], outside.tanh(), 0.0)  # passed: when another was next
         return {**state, "position": place, "velocity": velocity, "target": pad(-before, (0, 2))}, growth, missed
 
     def reward_terms(self, state: State) -> State:
-        bonus = state["gate_passed"].to(self.dtype)
-        growth = None
+        bonus, growth, world = state["gate_passed"].to(self.dtype), None, state
         if self.is_directed:
             state, growth, missed = self.lead(state)
             bonus = bonus - missed
@@ -379,6 +378,15 @@ class RacingEnv(QuadrotorEnv):
                 "across": -self.weights["across"] * across / (gap + 1.0),
                 "angular_velocity": -self.weights["angular_velocity"] * terms.norm(state["angular_velocity"]),
             }
+        if self.weights["closing"]:
+            place, velocity = world["position"] - self.centre, world["velocity"]
+            room, speed = self.half_box - torch.where(velocity > 0.0, place, -place), velocity
+            if self.scene is not None:
+                distance, away = self.scene.nearest(world)
+                closing = -(away * velocity).sum(-1, keepdim=True)
+                room, speed = torch.cat((room, distance), -1), torch.cat((speed, closing.clamp_min(0.0)), -1)
+            needed = speed.square() / (2.0 * BRAKING * room.clamp_min(LEAST_ROOM))
+            rewards["closing"] = -self.weights["closing"] * needed.clamp_min(1.0).log().sum(-1, keepdim=True)
         if self.gate_bonus != "binary":
             bonus = -torch.log(gap + 0.01) if self.gate_bonus == "log" else 1.0 / (gap + 0.05)
         return {**rewards, "gate": self.weights["gate"] * bonus}
@@ -428,8 +436,3 @@ def _metres(point: Tensor) -> list[float]:
 def _outside(aside: Tensor, opening: Tensor) -> Tensor:
     """How far places (*, 2) in the plane of a gate are beyond the edges of its opening (*, 1 or 2)."""
     return (terms.norm(aside) if opening.shape[-1] == 1 else aside.abs()) - opening
-
-
-def _box(beyond: Tensor) -> Tensor:
-    """The signed distance (*, 1) from a box, from how far a point lies beyond each of its faces (*, k)."""
-    return terms.norm(beyond.clamp_min(0.0)) + beyond.amax(-1, keepdim=True).clamp_max(0.0)

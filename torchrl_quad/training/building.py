@@ -54,8 +54,8 @@ def mean_of_all(x: Tensor) -> Tensor:
     return cat_all(x.detach().view(1)).mean()
 
 
-def of_first(x: float) -> float:
-    """The number that the first of the processes has."""
+def of_first(x: Any) -> Any:
+    """What the first of the processes has."""
     values = [x]
     if world_size() > 1:
         dist.broadcast_object_list(values)
@@ -161,6 +161,7 @@ def parameter_groups(name: str, module: nn.Module) -> list[dict[str, Any]]:
 class Optimizer(torch.optim.Adam):
     """Adam, a schedule that takes its learning rate from ``lr`` to ``final_lr`` over the run, and a bound on gradients.
 
+    The schedule ``inverse_sqrt`` is for runs of any length: it falls with one over the root of the iteration, after 50.
     ``name`` is the section of the network, "actor" or "critic"; ``module`` is that network, or the loss that holds it.
     """
 
@@ -174,6 +175,7 @@ class Optimizer(torch.optim.Adam):
             "linear": lambda share: 1.0 + share * (decay - 1.0),
             "exponential": lambda share: decay**share,
             "cosine": lambda share: decay + (1.0 - decay) * 0.5 * (1.0 + math.cos(math.pi * share)),
+            "inverse_sqrt": lambda share: max(share * (self.iterations - 1) / 50, 1.0) ** -0.5,
         }
         self.factor = factors[section.schedule]
 
@@ -182,7 +184,7 @@ class Optimizer(torch.optim.Adam):
         # A function of the finished share of the run, so that a run can be resumed and made longer.
         share = min(iteration / max(self.iterations - 1, 1), 1.0)
         for group in self.param_groups:
-            group["lr"] = self.first_lr * self.factor(share)
+            group["lr"] = self.first_lr * self.factor(share) * group.get("share", 1.0)
 
 
 class AdaptiveOptimizer(Optimizer):
@@ -191,8 +193,6 @@ class AdaptiveOptimizer(Optimizer):
     A horizon that moves it beyond 1.5 of the bound, the ``limit`` of this iteration, divides the rate by 1.5, and one
     that stays below 2/3 of it multiplies it. The rate keeps between 1e-6 and 20 times the first one.
     """
-
-    most = 20.0
 
     def __init__(self, cfg: DictConfig, name: str, module: nn.Module) -> None:
         super().__init__(cfg, name, module)
@@ -210,21 +210,7 @@ class AdaptiveOptimizer(Optimizer):
             if moved > self.limit:
                 group["lr"] = max(group["lr"] / 1.5, 1e-6)
             elif moved < self.limit / 2.25:
-                group["lr"] = min(group["lr"] * 1.5, self.most * self.first_lr)
-
-
-class PatientOptimizer(AdaptiveOptimizer):
-    """The same for a run of any length: its limit is ``max_kl`` times the patience that is left; ``lr`` is the most."""
-
-    most = 1.0
-
-    def anneal(self, iteration: float) -> None:
-        """Nothing: the recipe calls ``limit_to``."""
-
-    def limit_to(self, patience: float) -> float:
-        """Set the limit of an iteration, by the share of the patience that is left, and return it."""
-        self.limit = self.max_kl * max(patience, 0.02)
-        return self.limit
+                group["lr"] = min(group["lr"] * 1.5, 20.0 * self.first_lr)
 
 
 class ReturnScale(nn.Module):

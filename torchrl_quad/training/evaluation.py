@@ -72,15 +72,24 @@ def last_rise(rows: Sequence[Mapping[str, float]]) -> int:
     return rose
 
 
-def patience_left(rows: Sequence[Mapping[str, float]], patience: float | None, least: int = 10) -> float:
-    """What is left of the patience with a run: 1 if the last evaluation rose, 0 if none has for a share ``patience``.
+def has_levelled_off(
+    rows: Sequence[Mapping[str, float]], patience: float | None, solved: float = 0.5, least: int = 10
+) -> bool:
+    """Whether no evaluation of a run has risen for a share ``patience`` of it; never where that is None.
 
-    It is 1 for a run of fewer than ``least`` evaluations, until one has solved half of its episodes, since returns stay
-    level for long before the first are solved, and where ``patience`` is None.
+    A run of fewer than ``least`` evaluations goes on, and so does one that has not solved a share ``solved`` of an
+    evaluation's episodes, since returns stay level for long before the first are solved.
     """
-    if patience is None or len(rows) < least or max(row["eval/solved"] for row in rows) < 0.5:
-        return 1.0
-    return max(1.0 - (1.0 - last_rise(rows) / rows[-1]["steps"]) / patience, 0.0)
+    if patience is None or len(rows) < least or max(row["eval/solved"] for row in rows) < solved:
+        return False
+    return last_rise(rows) <= (1.0 - patience) * rows[-1]["steps"]
+
+
+def looks_ahead(rows: Sequence[Mapping[str, float]], patience: float | None) -> bool:
+    """Whether a run has once levelled off, for half of its patience; unsolved, after 30 evaluations at the earliest."""
+    half = None if patience is None else 0.5 * patience
+    seen = [rows[:n] for n in range(len(rows) + 1)]
+    return any(has_levelled_off(x, half) or has_levelled_off(x, half, solved=0.0, least=30) for x in seen)
 
 
 @contextlib.contextmanager

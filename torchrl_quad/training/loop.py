@@ -54,8 +54,9 @@ from torchrl_quad.training.evaluation import (
     drawing_from,
     evaluate,
     final_evaluation,
+    has_levelled_off,
     last_rise,
-    patience_left,
+    looks_ahead,
     print_summary,
     rounds,
     title,
@@ -72,7 +73,9 @@ class Run:
 
     Every ``eval.interval`` iterations the run writes a row of metrics and a checkpoint, which holds all that it needs
     to continue bit for bit, and the best policy so far: the one that solved most episodes in an evaluation, and of
-    those the one with the greatest return. At the end that policy flies from other starts.
+    those the one with the greatest return. At the end that policy flies from other starts. With ``eval.patience``, a
+    run that solves less than two thirds of what this policy solved goes back to it, with its critics and optimisers;
+    each further time at half the actor's rate, down to a sixteenth.
 
     The seconds are those of the loop, without set-up, compilation, evaluations and checkpoints.
 
@@ -85,7 +88,8 @@ class Run:
     Attributes:
         carry: where the next horizon starts; the algorithm sets it in each iteration.
         horizon: control steps of this iteration's rollout, ``cfg.horizon`` unless the algorithm sets it.
-        patience: the share of ``eval.patience`` that is left; at 0 the run ends.
+        levelled_off: whether its evaluations have, by ``eval.patience``; then it ends.
+        looks_ahead: whether they have once, for half of the patience; a recipe may then look further ahead.
     """
 
     def __init__(
@@ -120,7 +124,8 @@ class Run:
         logger_state = self._load(Path(cfg.resume)) if cfg.resume else None
         if not cfg.resume:
             self.carry = env.reset()
-        self.patience = patience_left(self.rows, cfg.eval.patience)
+        self.looks_ahead = looks_ahead(self.rows, cfg.eval.patience)
+        self.levelled_off = has_levelled_off(self.rows, cfg.eval.patience)
         self.is_over = not self.goes_on and (self.folder / "summary.json").exists()
         if rank() == 0 and not self.is_over:
             for name in ("summary.json", "failure.pt"):  # of the run before it was made longer, or went on
@@ -130,9 +135,18 @@ class Run:
                 OmegaConf.save(cfg, path, resolve=True)
 
     @property
+    def is_due(self) -> bool:
+        """Whether it is time for an evaluation; with ``eval.patience`` they also wait for 2 % more iterations."""
+        if self.cfg.eval.patience is not None and self.iteration < 1.02 * (
+            self.rows[-1]["iteration"] if self.rows else 0
+        ):
+            return False
+        return self.iteration % self.cfg.eval.interval == 0
+
+    @property
     def goes_on(self) -> bool:
         """Whether there are steps left, and a reason to fly them."""
-        return self.steps < self.total_steps and self.patience > 0
+        return self.steps < self.total_steps and not self.levelled_off
 
     def __iter__(self) -> Iterator[int]:
         if self.is_over:
@@ -164,18 +178,24 @@ class Run:
                 self.iteration += 1
                 self.steps += self.horizon * self.drones
                 bar.update(self.horizon * self.drones)
-                if self.iteration % self.cfg.eval.interval == 0 or self.steps >= self.total_steps:
+                if self.is_due or self.steps >= self.total_steps:
+                    best = None
                     if rank() == 0:
                         metrics = self._evaluate()
                         solved = metrics["eval/solved"]
                         bar.set_postfix_str(f"return {metrics['eval/return']:.2f}, solved {solved:.0%}")
-                        self.patience = patience_left(self.rows, self.cfg.eval.patience)
-                    self.patience = of_first(self.patience)
+                        self.looks_ahead = looks_ahead(self.rows, self.cfg.eval.patience)
+                        self.levelled_off = has_levelled_off(self.rows, self.cfg.eval.patience)
+                        if 0.5 <= self.best["solved"] > 1.5 * solved:
+                            best = self.best.get("stateful")
+                    self.looks_ahead, self.levelled_off, best = of_first((self.looks_ahead, self.levelled_off, best))
+                    if best is not None:
+                        self._roll_back(best)
                     self.recorded.clear()
                     self.starts.clear()
                     self._save(self.folder / "checkpoint.pt")
         if rank() == 0:
-            if self.patience == 0:
+            if self.levelled_off:
                 print(f"Stopped before total_steps: no evaluation has risen since step {last_rise(self.rows):,}.")
             self._finish()
             print(f"{time.perf_counter() - began:.0f} s in all, {self.seconds:.0f} s of them training.")
@@ -273,7 +293,21 @@ class Run:
             policy = {"actor": self.flown, "normalizer": self.normalizer}
             weights = {name: copy.deepcopy(x.state_dict()) for name, x in policy.items() if x is not None}
             self.best = {**score, "steps": self.steps, **weights}
+            if self.cfg.eval.patience is not None:
+                self.best["stateful"] = copy.deepcopy([x.state_dict() for x in self.stateful])
         return metrics
+
+    def _roll_back(self, stateful: list[dict[str, Any]]) -> None:
+        """Go back to the best policy with its critics and optimisers, from fresh starts."""
+        for x, state in zip(self.stateful, stateful, strict=True):
+            x.load_state_dict(copy.deepcopy(state))
+            if isinstance(x, Optimizer) and x.name == "actor":
+                for group in state["param_groups"]:  # for the next time
+                    group["share"] = max(group.get("share", 1.0) / 2, 1 / 16)
+        self.actor.load_state_dict(
+            self.flown.state_dict()
+        )  # the weights of which the best one was the mean may be poor
+        self.carry = self.env.reset()
 
     def _diagnose(self) -> dict[str, float]:
         """Measure what reward and gradient of the next horizon are made of; change nothing."""

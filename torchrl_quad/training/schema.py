@@ -78,7 +78,7 @@ SETTINGS: dict[str, tuple[Any, str]] = {
     "network.activation": (cast("Any", Literal)[tuple(ACTIVATIONS.split())], ""),
     "network.input_scale": (Positive, "The observation is multiplied by this."),
     "network.lr": (Positive, "The learning rate at the start; to keep a network as it is, write 1e-12."),
-    "network.schedule": (Literal["constant", "linear", "exponential", "cosine"], ""),
+    "network.schedule": (Literal["constant", "linear", "exponential", "cosine", "inverse_sqrt"], ""),
     "network.final_lr": (NonNegative, "The learning rate at the end of the run."),
     "network.betas": (
         Annotated[list[Below1], Field(min_length=2, max_length=2)],
@@ -158,9 +158,12 @@ LOSSES: dict[str, type | None] = {
 SET_BY_LOOPS = {"horizon", "average", "reduction", "delay_value", "delay_qvalue"}
 # Settings that others switch off: where, and why.
 IDLE: list[tuple[str, Callable[[Any], bool], str]] = [
-    ("actor.final_lr", lambda c: c["actor"]["schedule"] == "constant", "actor.schedule=constant"),
-    ("critic.final_lr", lambda c: c["critic"]["schedule"] == "constant", "critic.schedule=constant"),
-    ("actor.schedule actor.final_lr", lambda c: c["algorithm"] in ("hybrid", "train"), "actor.max_kl sets the rate"),
+    *(
+        (f"{network}.final_lr", lambda c, n=network, x=kind: c[n]["schedule"] == x, f"{network}.schedule={kind}")
+        for network in ("actor", "critic")
+        for kind in ("constant", "inverse_sqrt")
+    ),
+    ("actor.schedule actor.final_lr", lambda c: c["algorithm"] == "hybrid", "actor.max_kl sets the rate"),
     ("actor.input_scale critic.input_scale", lambda c: c["normalize"], "normalize=true"),
     ("actor.channels", lambda c: c["env"].get("camera") is None, "env.camera=null"),
     ("actor.vision", lambda c: c["env"].get("camera") is None and c["actor"]["vision"], "env.camera=null"),

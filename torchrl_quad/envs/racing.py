@@ -318,8 +318,7 @@ class RacingEnv(QuadrotorEnv):
         if self.is_directed:
             time, _ = self.crossing(previous, state)
         else:
-            ends = previous["position"], state["position"]
-            time = terms.ball_entry(*ends, previous["target"], self.gate_radius)
+            time = terms.ball_entry(previous["position"], state["position"], previous["target"], self.gate_radius)
         return {"gate": terms.Event(state["gate_passed"], time, self.weights["gate"])}
 
     def observe(self, state: State) -> Tensor:

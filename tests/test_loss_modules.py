@@ -18,7 +18,7 @@ from torchrl.objectives.value import GAE
 from torchrl_quad import HoveringEnv, RacingEnv, VisitedStateBuffer, differentiable_rollout
 from torchrl_quad.errors import UserError
 from torchrl_quad.modules import make_actor, make_qvalue, make_value
-from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss
+from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, PODSLoss, SAPOLoss, SHACLoss
 from torchrl_quad.objectives.ppo import PlainClipPPOLoss
 
 
@@ -94,6 +94,14 @@ def test_steps_that_a_collector_masks_do_not_count(env64):
         assert not torch.equal(out["loss_actor"], loss(rollout)["loss_actor"])
     cut = masked(rollout, counts & (torch.arange(6) < 3))
     torch.testing.assert_close(BPTTLoss(actor)(cut)["loss_actor"], BPTTLoss(actor)(rollout[:, :3])["loss_actor"])
+    pods = PODSLoss(actor)
+    flight = pods.write_action_target(cut).detach()
+    changed = flight["action_target"] != flight["action"]
+    assert changed[:, 0].any() and not changed[:, 3:].any()
+    for x in actor.parameters():  # from which the policy moves away
+        x.data += 0.1
+    for name, x in pods(flight).items():
+        torch.testing.assert_close(x, pods(flight[:, :3])[name])
 
 
 def test_keys_can_be_renamed():

@@ -142,26 +142,21 @@ def td_lambda(reward: Tensor, done: Tensor, next_value: Tensor, gamma: Tensor, l
 # -- gradients in single actions, and how a policy learns from them ----------------------------------------------------
 
 
-def action_gradient(objective: Tensor, action: Tensor) -> Tensor:
+def action_gradient(objective: Tensor, action: Tensor, *, create_graph: bool = False) -> Tensor:
     """The gradient of a scalar in each action of a rollout, by all that follows from it, the policy included.
 
     ``action`` is ``rollout["action"]`` (*, horizon, k) as it was flown, no copy or part, with its graph, which is kept.
+    With ``create_graph`` the gradient can be differentiated again, which a compiled flight refuses.
     """
     steps, node = sources_of_steps(action), cast(Any, action.grad_fn)
     if isinstance(steps, Tensor):
         node.learns = False  # the weights of a policy inside the compiled horizon get no gradient here
         try:
-            (grad,) = torch.autograd.grad(objective, steps, retain_graph=True)
+            (grad,) = torch.autograd.grad(objective, steps, retain_graph=True, create_graph=create_graph)
         finally:
             node.learns = True
         return grad.movedim(0, -2)
-    return eager_gradient(objective, action)
-
-
-def eager_gradient(objective: Tensor, action: Tensor, *, create_graph: bool = False) -> Tensor:
-    """As :func:`action_gradient`, of an eager flight; ``create_graph`` lets it be differentiated again."""
-    steps, node = sources_of_steps(action), cast(Any, action.grad_fn)
-    dim = None if steps is None or isinstance(steps, Tensor) else node._saved_dim  # of the stack; -2 without its sign
+    dim = None if steps is None else node._saved_dim  # of the stack; -2 without its sign
     if steps is None or len(steps) != action.shape[-2] or dim not in (action.ndim - 2, 2**64 - 2):
         raise UserValueError(
             "The gradient of each action needs one rollout as differentiable_rollout returned it, whole and with its "

@@ -14,14 +14,7 @@ from torch import Tensor
 
 from torchrl_quad.data.unwrap import leaf
 from torchrl_quad.errors import Unsupported
-from torchrl_quad.objectives.calls import (
-    act_again,
-    action_gradient,
-    eager_gradient,
-    median_length,
-    sources_of_steps,
-    with_fixed,
-)
+from torchrl_quad.objectives.calls import act_again, action_gradient, median_length, sources_of_steps, with_fixed
 from torchrl_quad.objectives.pathwise import PathwiseLoss
 from torchrl_quad.options import Positive, between
 
@@ -97,32 +90,36 @@ class PODSLoss(PathwiseLoss):
                 "PODSLoss(order=2) differentiates twice, and a compiled flight only once: call env.eager() before "
                 "flying (in a recipe: compile=false), or take order=1."
             )
-        whole = eager_gradient(objective.sum(), action, create_graph=True) if second else None
-        grad, _ = self._measure(action_gradient(objective.sum(), action) if whole is None else whole.detach())
+        whole = action_gradient(objective.sum(), action, create_graph=second)
+        grad, _ = self._measure(whole.detach())
         damping = median_length(grad.norm(dim=-1)) / self.step
         change = grad / damping
-        if whole is not None:
+        if second:
 
             def damped(x: Tensor) -> Tensor:
                 """lambda - the second derivative, times a change."""
-                return damping * x - eager_gradient((whole * x).sum(), action)
+                return damping * x - action_gradient((whole * x).sum(), action)
 
             change = conjugate_gradients(damped, grad, change, self.iterations)
         return tensordict.set(self.tensor_keys.action_target, action.detach() + change.nan_to_num(0.0, 0.0, 0.0))
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Half the squared distance of the policy's actions from the targets in a rollout, which are added if missing,
-        and its metadata."""
+        and its metadata; steps that do not count are left out."""
         if self.tensor_keys.action_target not in tensordict:
             tensordict = self.write_action_target(tensordict.copy())
         target = leaf(tensordict, self.tensor_keys.action_target)
         action = act_again(self.actor_network, self.actor_network_params, tensordict)[self.tensor_keys.action]
         rewards = self._discounts(tensordict) * self._next(tensordict, "reward")
-        metadata = {
-            "n_step_return": rewards.sum((-2, -1)).detach().mean(),
-            "change": (target - leaf(tensordict, self.tensor_keys.action)).norm(dim=-1).detach().mean(),
-        }
-        return self._reduce_loss(0.5 * (action - target).square().sum(-1).mean(-1)), metadata
+        change = (target - leaf(tensordict, self.tensor_keys.action)).norm(dim=-1).detach()
+        distance, counts = 0.5 * (action - target).square().sum(-1), self._counts(tensordict)
+        if counts is None:
+            mean, change = distance.mean(-1), change.mean()
+        else:
+            counts = counts.squeeze(-1)
+            mean = torch.where(counts, distance, 0.0).sum(-1) / counts.sum(-1).clamp(min=1)
+            change = torch.where(counts, change, 0.0).sum() / counts.sum().clamp(min=1)
+        return self._reduce_loss(mean), {"n_step_return": rewards.sum((-2, -1)).detach().mean(), "change": change}
 
 
 def conjugate_gradients(

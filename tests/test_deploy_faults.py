@@ -146,7 +146,7 @@ def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch, trace_once):
     hooked = make_actor(env)
     hooked[0].module.mlp.register_forward_hook(lambda *_: None)
     refuses("exports what make_actor and make_visual_actor build", hooked)
-    refuses("the bundle observes something else than Counting does, by", env=Counting(num_envs=16, max_episode_steps=8))
+    refuses("the bundle observes something else than Counting does, by", env=Counting(num_envs=64, max_episode_steps=8))
     refuses("the policy reads 13 numbers, the environment observes 40", env=make_env("tracking", num_envs=2))
     refuses("supports only one transform, an ObservationNormalizer", env=TransformedEnv(env, RewardSum()))
     broken = make_actor(env)
@@ -156,10 +156,10 @@ def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch, trace_once):
     trace_once("hovering")
     strong = load_drone("visfly").replace(max_thrust_to_weight=30.0)
     with pytest.warns(DroneWarning, match="the rotors reach 4.446 times the weight"):
-        strongest = HoveringEnv(num_envs=2, max_episode_steps=4, drone=strong)
+        strongest = HoveringEnv(num_envs=64, max_episode_steps=4, drone=strong)
     said = r"export_policy: output.thrust.range_in_weights.1.: 30.0 is greater than the maximum of 20. A bundle flies"
     refuses(said, env=strongest)
-    other = HoveringEnv(num_envs=2, max_episode_steps=8)
+    other = HoveringEnv(num_envs=64, max_episode_steps=8)
     other.dynamics.controller.action_units = {"thrust": "N", "throttle": "1"}
     refuses("exports the controls rates, attitude, velocity, rotor_thrusts; got 'rates'", env=other)
     of_an_error = ObservationNormalizer(env, ("metrics", "position_error"))

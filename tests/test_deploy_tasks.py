@@ -117,7 +117,7 @@ def test_a_contract_names_what_the_rules_of_a_task_read_and_nothing_else(export_
 def test_a_race_with_noise_and_delay_is_exported_though_gates_are_counted_from_true_positions(trace_once, tmp_path):
     trace_once("racing")  # whose rules are the same
     sensors = {"observation_noise": {"position": 0.3}, "observation_delay": 2}
-    env = RacingEnv(num_envs=16, max_episode_steps=16, action_delay=0, **sensors)
+    env = RacingEnv(num_envs=64, max_episode_steps=16, action_delay=0, **sensors)
     bundle = load_bundle(export_policy(make_actor(env, (8,)), env, tmp_path / "policy"))
     assert bundle.contract["observation_delay"] == 2
     (gate, after), before = env.gates[1:3].numpy(), np.array([-1.0, 0.0, 0.0])
@@ -134,7 +134,7 @@ def corner(phase):
 
 
 def test_a_curve_with_corners_and_double_precision_export(tmp_path):
-    env = TrackingEnv(num_envs=2, curve=corner, period=4.0, dtype=torch.float64, max_episode_steps=16)
+    env = TrackingEnv(num_envs=64, curve=corner, period=4.0, dtype=torch.float64, max_episode_steps=16)
     bundle = load_bundle(export_policy(make_actor(env, (4,)), env, tmp_path / "policy"))
     bundle.reset(phase=1.0)
     bundle(resting(position=[0, 0, 2]))
@@ -177,7 +177,7 @@ def test_a_task_that_cannot_be_judged_without_its_reward_still_flies(tmp_path):
         metrics = CornerEnv.episode_metrics(self, rollout)
         return {**metrics, "solved": metrics["solved"] * (metrics["return"] > 0)}
 
-    env = method("episode_metrics", by_return)(4, max_episode_steps=8)
+    env = method("episode_metrics", by_return)(64, max_episode_steps=8)
     bundle = load_bundle(export_policy(make_actor(env, (4,)), env, tmp_path / "policy"))
     bundle(resting())
     why = "solved: it follows from 'next.reward', which no drone measures"

@@ -132,7 +132,7 @@ def break_drones(env, parameter):
 
 def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
     options = {**EVERYTHING, "reward": "position", "control": "velocity"}
-    env = RacingEnv(num_envs=4, max_episode_steps=11, dtype=torch.float64, **options)
+    env = RacingEnv(num_envs=4, max_episode_steps=11, dt=0.01, dtype=torch.float64, **options)
     drag = env.nominal.linear_drag.clone().requires_grad_()
     env.params = env.nominal.replace(linear_drag=drag)
     actor = make_actor(env, in_keys=["observation", ("state", "velocity")], return_log_prob=True)

@@ -8,7 +8,7 @@ from typing import Any, TypeVar, cast
 
 import torch
 import torch.distributed as dist
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
@@ -116,7 +116,8 @@ def network(cfg: DictConfig, name: str, env: EnvBase | None = None) -> dict[str,
     options: dict[str, Any] = {"num_cells": list(section.num_cells), "activation": activation, "input_scale": scale}
     if section.get("in_keys") is not None:  # a critic may know more than the policy, of the state
         keys = [key if isinstance(key, str) else tuple(key) for key in section.in_keys]
-        return options | {"in_keys": keys, "input_scale": plain(section.input_scale)}
+        scale = section.input_scale  # one, or one for each entry
+        return options | {"in_keys": keys, "input_scale": plain(scale) if OmegaConf.is_list(scale) else scale}
     if env is not None and "obstacle" in observed(env):  # a critic reads where it is; a policy has images of it
         options |= {"in_keys": ["observation", "obstacle"], "input_scale": [scale, 1.0]}
     return options

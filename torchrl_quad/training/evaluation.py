@@ -86,10 +86,12 @@ def has_levelled_off(
 
 
 def looks_ahead(rows: Sequence[Mapping[str, float]], patience: float | None) -> bool:
-    """Whether a run has once levelled off, for half of its patience; unsolved, after 30 evaluations at the earliest."""
-    half = None if patience is None else 0.5 * patience
-    seen = [rows[:n] for n in range(len(rows) + 1)]
-    return any(has_levelled_off(x, half) or has_levelled_off(x, half, solved=0.0, least=30) for x in seen)
+    """Whether a run has solved half of an evaluation's episodes, or has once levelled off without.
+
+    That is for half of its patience, and after 30 evaluations at the earliest.
+    """
+    level = (has_levelled_off(rows[:n], patience and patience / 2, solved=0.0, least=30) for n in range(len(rows) + 1))
+    return any(row["eval/solved"] >= 0.5 for row in rows) or any(level)
 
 
 @contextlib.contextmanager

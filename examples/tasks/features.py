@@ -9,8 +9,8 @@ from torchrl_quad.dynamics.quaternion import rotate_inverse
 class Features(HoveringEnv):
     """Recover from a tilt and a push, 3 m before seven landmarks on a wall; solved as hovering is. It takes a memory.
 
-    Observed: of each landmark its place in the image of a camera that looks ahead, 90 degrees wide and high, -1 to 1,
-    or zeros, and whether it is in the image; and the last command.
+    Observed: of each landmark ten times its place in the image of a camera that looks ahead, 90 degrees wide and high,
+    -1 to 1, or zeros, and whether it is in the image; and the last command.
     """
 
     defaults = {
@@ -29,7 +29,7 @@ class Features(HoveringEnv):
         ahead, aside = rotate_inverse(state["quaternion"].unsqueeze(-2), way).split((1, 2), -1)
         place = aside / ahead.clamp_min(0.1)
         seen = (ahead > 0.1) & (place.abs() < 1.0).all(-1, keepdim=True)
-        return torch.cat((torch.where(seen, place, 0.0), seen.to(place)), -1).flatten(-2)
+        return torch.cat((torch.where(seen, 10.0 * place, 0.0), seen.to(place)), -1).flatten(-2)
 
     def observation_bounds(self):
-        return self.tensor([1.0] * 21)
+        return self.tensor([10.0] * 21)

@@ -64,12 +64,11 @@ class RacingEnv(QuadrotorEnv):
     half of the smallest opening before the gate; v_t is how fast the way over that point gets shorter. A step that
     crosses the plane of the gate elsewhere, or touches a frame, takes up to a bonus away, tanh(m) of it at m [m] from
     half of the opening. A drone pays 0.5 log(a / 15) for each side of the box ahead, and for the nearest obstacle, that
-    takes a > 15 m/s2 to stop before, a = v^2 / (2 d) with the speed v towards it and the distance d: that it would
-    crash there has no gradient. ``weights={"closing": 0.5}`` does so with spheres, too.
+    takes a > 15 m/s2 to stop before, a = v^2 / (2 d) with the speed v towards it and the distance d, since a crash has
+    no gradient; with spheres, too, by ``weights={"closing": 0.5}``.
 
-    A gate that is a point is passed when the straight line that the drone flew in a control step comes within 0.3 m of
-    it. A gate with a direction is passed when that line crosses its plane, from behind, within its opening. The reward
-    of that step is already about the gate after it.
+    A point is passed when the straight line of a control step comes within 0.3 m of it, a gate with a direction when
+    that line crosses its plane, from behind, within its opening. The reward of that step is about the gate after it.
 
     Start: level and at rest, uniformly within 0.2 m of one of four points along each axis, each before another gate.
     State added: ``gate`` (1), the index of the next; ``target`` (3) [m], its centre; ``gate_passed`` (1), whether this
@@ -81,9 +80,8 @@ class RacingEnv(QuadrotorEnv):
     truncated after ``max_episode_steps``, 512. Success of a state: 8 gates passed. Success of an episode: 8 gates,
     without a crash. A track that is not ``closed`` ends in success at its last gate.
 
-    Metrics: ``gates_passed``; ``lap_time`` [s], from a gate to the same gate again, NaN for an episode without a full
-    lap (not ``closed``: from a start before the first gate to the last gate); ``time_near_gate`` [s], within 1 m of the
-    next gate.
+    Metrics: ``gates_passed``; ``lap_time`` [s], from a gate to the same gate again (not ``closed``: from a start before
+    the first to the last), NaN without a full lap; ``time_near_gate`` [s], within 1 m of the next gate.
 
     A track is a mapping, or a YAML file of one:
 
@@ -102,8 +100,7 @@ class RacingEnv(QuadrotorEnv):
       with a direction; ``start``, only the first; ``start_range``, 0.2 m;
     - ``closed``, whether the first gate follows the last, true;
     - ``floor`` [m], 0; ``box``, the lowest and the highest corner [m] of where drones may be, instead of 4 m of room;
-    - ``position_jitter`` [m] and ``rotation_jitter`` [rad], three numbers each: how far each episode moves and turns
-      gates to both sides;
+    - ``position_jitter`` [m], ``rotation_jitter`` [rad], three numbers each: how far each episode moves gates;
     - ``random``, instead of gates: the rules (:class:`~torchrl_quad.envs.track.Course`) by which each episode draws
       other gates;
     - ``scene``, obstacles, as for :class:`~torchrl_quad.envs.QuadrotorEnv`.

@@ -124,6 +124,9 @@ class Run:
         logger_state = self._load(Path(cfg.resume)) if cfg.resume else None
         if not cfg.resume:
             self.carry = env.reset()
+        self.evaluated = (
+            self.rows[-1]["iteration"] if self.rows else 0
+        )  # all processes know when; the first has the rows
         self.looks_ahead = looks_ahead(self.rows, cfg.eval.patience)
         self.levelled_off = has_levelled_off(self.rows, cfg.eval.patience)
         self.is_over = not self.goes_on and (self.folder / "summary.json").exists()
@@ -137,11 +140,8 @@ class Run:
     @property
     def is_due(self) -> bool:
         """Whether it is time for an evaluation; with ``eval.patience`` they also wait for 2 % more iterations."""
-        if self.cfg.eval.patience is not None and self.iteration < 1.02 * (
-            self.rows[-1]["iteration"] if self.rows else 0
-        ):
-            return False
-        return self.iteration % self.cfg.eval.interval == 0
+        waits = self.cfg.eval.patience is not None and self.iteration < 1.02 * self.evaluated
+        return not waits and self.iteration % self.cfg.eval.interval == 0
 
     @property
     def goes_on(self) -> bool:
@@ -179,7 +179,7 @@ class Run:
                 self.steps += self.horizon * self.drones
                 bar.update(self.horizon * self.drones)
                 if self.is_due or self.steps >= self.total_steps:
-                    best = None
+                    best, self.evaluated = None, self.iteration
                     if rank() == 0:
                         metrics = self._evaluate()
                         solved = metrics["eval/solved"]
@@ -304,9 +304,8 @@ class Run:
             if isinstance(x, Optimizer) and x.name == "actor":
                 for group in state["param_groups"]:  # for the next time
                     group["share"] = max(group.get("share", 1.0) / 2, 1 / 16)
-        self.actor.load_state_dict(
-            self.flown.state_dict()
-        )  # the weights of which the best one was the mean may be poor
+        # The weights of which the best policy was the mean may be poor.
+        self.actor.load_state_dict(self.flown.state_dict())
         self.carry = self.env.reset()
 
     def _diagnose(self) -> dict[str, float]:

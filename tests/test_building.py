@@ -1,5 +1,7 @@
 """The building blocks of a recipe, and horizons with their graph in TorchRL's Trainer and collectors."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from omegaconf import OmegaConf
@@ -25,7 +27,7 @@ from torchrl_quad.training.building import (
     shuffled,
 )
 from torchrl_quad.training.evaluation import has_levelled_off, last_rise, looks_ahead
-from torchrl_quad.training.loop import backward
+from torchrl_quad.training.loop import Run, backward
 
 
 def optimizer(iterations, kind=Optimizer, **options):
@@ -125,6 +127,12 @@ def test_a_run_levels_off_when_no_evaluation_has_risen_for_a_share_of_it():
     assert not looks_ahead(low + later, None)
     curve[7]["eval/solved"] = 0.52
     assert last_rise(curve) == 80 and last_rise([*curve, curve[-1] | {"eval/return": float("nan")}]) == 80
+
+
+def test_when_a_run_evaluates_follows_from_what_every_process_knows():
+    cfg = OmegaConf.create({"eval": {"patience": 0.5, "interval": 2}})
+    run = {"cfg": cfg, "evaluated": 102}  # and no rows, which the first process alone has
+    assert [Run.is_due.fget(SimpleNamespace(**run, iteration=i)) for i in (103, 104, 105, 106)] == [*[False] * 3, True]
 
 
 def test_the_gradient_of_alpha_takes_nothing_of_the_actor_s_norm():

@@ -2,18 +2,22 @@
 
 python -m benchmarks.gpu
 
-Every row is written as soon as it is known, and "result" says "ok", what failed, or that no time was left. The largest
-numbers of environments come last. ``--device cpu`` with small numbers goes the same way.
+The checks compile side by side, each in a process of its own; speeds are measured one by one when all else is over.
+Every row is written as soon as it is known, and "result" says "ok", what failed, or that no time was left.
+``--device cpu`` with small numbers goes the same way.
 """
 
 from __future__ import annotations
 
-import contextlib
+import itertools
+import multiprocessing
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,6 +25,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch._inductor.runtime.cache_dir_utils import cache_dir
 from torchrl.envs import EnvBase
 
 from benchmarks.report import command_line, in_own_process, save
@@ -28,15 +33,12 @@ from benchmarks.throughput import forward_only, with_gradient
 from benchmarks.time_to_solve import RECIPES, solve
 from torchrl_quad import ActionSequence, differentiable_rollout, make_actor, make_env
 
-MODES = ["eager", "compiled", "graphs"]  # the last one compiled, and launched by CUDA graphs
+MODES = ["eager", "compiled"]
 Row = dict[str, Any]
 
 
 def build(task: str, mode: str, **options: Any) -> EnvBase:
-    env = make_env(task, seed=0, **options)
-    if mode == "eager":
-        return env
-    return env.compile(**({"mode": "reduce-overhead"} if mode == "graphs" else {}))
+    return make_env(task, seed=0, compile=mode == "compiled", **options)
 
 
 def synchronize(device: str) -> None:
@@ -47,7 +49,7 @@ def synchronize(device: str) -> None:
 def difference(device: str, mode: str, n: int, task: str = "racing", horizon: int = 16) -> Row:
     """How far rewards and gradients of a flight on the device are from those on the CPU, relative to the largest."""
     options = {"num_envs": n, "dtype": torch.float64}
-    host, env = build(task, "eager", **options), build(task, mode, device=device, **options)
+    host, env = make_env(task, seed=0, **options), build(task, mode, device=device, **options)
     start = host.reset()
     actions = host.hover_action + 0.1 * torch.randn(horizon, n, 4, dtype=torch.float64)
 
@@ -59,34 +61,36 @@ def difference(device: str, mode: str, n: int, task: str = "racing", horizon: in
         return [reward.detach().cpu(), given.grad.cpu()]
 
     expected = fly(host)
-    for _ in range(2):  # a graph is recorded by the first flight, and replayed by the second
-        found = fly(env)
-    values, gradients = (float((a - b).abs().max() / b.abs().max()) for a, b in zip(found, expected, strict=True))
+    pairs = zip(fly(env), expected, strict=True)
+    values, gradients = (float((a - b).abs().max() / b.abs().max()) for a, b in pairs)
     verdict = "ok" if max(values, gradients) <= 1e-9 else "differs"
     return {"values": f"{values:.1e}", "gradients": f"{gradients:.1e}", "result": verdict}
 
 
-@contextlib.contextmanager
-def no_waiting(device: str) -> Iterator[None]:
-    """Raise where the host waits for the device."""
+def debug_waits(device: str, mode: str) -> None:
     if device != "cpu":
-        torch.cuda.set_sync_debug_mode("error")
-    try:
-        yield
-    finally:
-        if device != "cpu":
-            torch.cuda.set_sync_debug_mode("default")
+        torch.cuda.set_sync_debug_mode(mode)
 
 
-def waits(device: str, mode: str, n: int, horizon: int = 16) -> Row:
-    """Fly and differentiate a horizon in which episodes end, and never wait for the device."""
-    env = build("racing", mode, num_envs=n, device=device, max_episode_steps=5)
+def waits(device: str, n: int, horizon: int = 16) -> Row:
+    """How often the host waits for the device in a horizon and its gradient: as often in one that is twice as long."""
+    env = build("racing", "compiled", num_envs=n, device=device, max_episode_steps=5)
     actor, carry = make_actor(env), env.reset()
-    for guard in (contextlib.nullcontext(), contextlib.nullcontext(), no_waiting(device)):  # the first ones compile
-        with guard:
-            rollout, carry = differentiable_rollout(env, actor, carry, horizon)
+
+    def count(steps: int) -> list[str]:
+        nonlocal carry
+        with warnings.catch_warnings(record=True) as seen:
+            warnings.simplefilter("always")
+            debug_waits(device, "warn")
+            rollout, carry = differentiable_rollout(env, actor, carry, steps)
             rollout["next", "reward"].mean().backward()
-    return {"result": "ok"}
+            debug_waits(device, "default")
+        return [f"{Path(w.filename).name}:{w.lineno}" for w in seen if "synchroniz" in str(w.message)]
+
+    count(horizon)  # compiles
+    once, twice = count(horizon), count(2 * horizon)
+    verdict = "ok" if len(once) == len(twice) else f"{len(twice)} in twice the horizon"
+    return {"waits": len(once), "where": " ".join(sorted(set(twice))), "result": verdict}
 
 
 def checkpoint(device: str) -> Row:
@@ -103,10 +107,9 @@ def checkpoint(device: str) -> Row:
 
 
 def learned(device: str, algorithm: str, task: str, limit: float, overrides: list[str]) -> Row:
-    """Seconds from the start of a recipe to 99 % of the episodes solved."""
-    with tempfile.TemporaryDirectory() as cache:
-        options = [f"task={task}", f"device={device}", "eval.interval=5", *overrides]
-        seconds = solve(algorithm, 0, options, Path(cache), limit)
+    """Seconds from the start of a recipe to 99 % of the episodes solved, with what is in the compile cache."""
+    options = [f"task={task}", f"device={device}", "eval.interval=5", *overrides]
+    seconds = solve(algorithm, 0, options, Path(cache_dir()), limit)
     return {"seconds": "" if seconds is None else round(seconds, 1), "result": "ok" if seconds else "not solved"}
 
 
@@ -129,21 +132,33 @@ def written(rollout: TensorDictBase) -> int:
     return sum(storage.nbytes() for storage in storages.values())
 
 
-def speed(device: str, mode: str, n: int, horizon: int, policy: bool) -> Row:
-    """Thousand control steps per second, and the share of what memory allows: to write the rollout, then to read it."""
+def speed(device: str, mode: str, n: int, horizon: int, policy: bool, turn: Path, deadline: float) -> Row:
+    """Thousand control steps per second, and the share of what memory allows: to write the rollout, then to read it.
+
+    It compiles at once, and measures as soon as the file ``turn`` exists.
+    """
     env = build("hovering", mode, num_envs=n, device=device)
     actor, sizes = make_actor(env), []
     actions = env.hover_action + 0.1 * torch.randn(horizon, n, 4, device=device)
 
     def fly(actions: Tensor) -> Tensor:
-        rollout, _ = differentiable_rollout(env, actor if policy else ActionSequence(actions), env.reset(), horizon)
+        steps = ActionSequence(actions)
+        rollout, _ = differentiable_rollout(env, actor if policy else steps, env.reset(), len(actions))
         sizes[:] = [written(rollout)]
         return rollout["next", "reward"].sum()
 
+    for run in (forward_only, with_gradient):
+        run(fly, actions[:2])
+    if device != "cpu":
+        torch.cuda.empty_cache()  # for the others
+    while not turn.exists():
+        if time.time() > deadline:
+            return {"result": "no time left"}
+        time.sleep(0.1)
     row: Row = {"result": "ok"}
     for name, run, passes in (("forward", forward_only, 1), ("with gradient", with_gradient, 2)):
         best = float("inf")
-        for _ in range(5):
+        for _ in range(6):
             synchronize(device)
             start = time.perf_counter()
             run(fly, actions)
@@ -154,41 +169,42 @@ def speed(device: str, mode: str, n: int, horizon: int, policy: bool) -> Row:
     return row
 
 
-def speeds(device: str, modes: list[str], n: int, horizon: int) -> list[tuple[Row, float, Callable[..., Any], Any]]:
-    """The checks of speed with n environments, compiled, as far as modes has them."""
-    named = [(mode, policy) for mode in modes if mode != "eager" or len(modes) == 1 for policy in (False, True)]
-    check = "speed, actions given", "speed, policy inside"
-    return [
-        ({"check": check[policy], "mode": mode, "num_envs": n}, 20, speed, (device, mode, n, horizon, policy))
-        for mode, policy in named
-    ]
-
-
 def main() -> None:
-    sizes, options = [1024, 32768, 1048576], {"device": "cuda", "horizon": 32, "seconds": 480.0}
+    sizes, options = [1024, 32768], {"device": "cuda", "horizon": 32, "seconds": 480.0}
     args = command_line(__doc__, "gpu.csv", num_envs=sizes, modes=MODES, overrides=[""], check_envs=256, **options)
-    deadline, device, overrides = time.monotonic() + args.seconds, args.device, [x for x in args.overrides if x]
-    checks: list[tuple[Row, float, Callable[..., Any], tuple[Any, ...]]] = []  # what, seconds that it may need, and how
+    start, device, overrides = time.time(), args.device, [x for x in args.overrides if x]
+    early, late = start + 0.7 * args.seconds, start + args.seconds
+    checks: list[tuple[Row, float, Callable[..., Any], tuple[Any, ...]]] = []  # what, until when, and how
     for mode in args.modes:
-        own = {"mode": mode, "num_envs": args.check_envs}
-        checks.append(({"check": "equals the CPU", **own}, 30, difference, (device, mode, args.check_envs)))
-        checks.append(({"check": "waits for nothing", **own}, 30, waits, (device, mode, args.check_envs)))
-    smallest, *others = [speeds(device, args.modes, n, args.horizon) for n in sorted(args.num_envs)]
-    checks += [*smallest, ({"check": "checkpoint to CPU"}, 30, checkpoint, (device,))]
-    for task, limit in (("hovering", 45.0), ("racing", 90.0)):
-        checks.append(({"check": f"{task} solved"}, limit, learned, (device, "shac", task, limit, overrides)))
-    checks += [check for same_size in others for check in same_size]
+        own: Row = {"mode": mode, "num_envs": args.check_envs}
+        checks.append(({"check": "equals the CPU", **own}, early, difference, (device, mode, args.check_envs)))
+    if "compiled" in args.modes:  # eager, TorchRL's TanhNormal waits four times a step
+        own = {"mode": "compiled", "num_envs": args.check_envs}
+        checks.append(({"check": "waits for the device", **own}, early, waits, (device, args.check_envs)))
+    checks.append(({"check": "checkpoint to CPU"}, early, checkpoint, (device,)))
+    limit = early - start - 10  # its process has to start, and to end
+    checks.append(({"check": "hovering solved"}, early, learned, (device, "shac", "hovering", limit, overrides)))
     rows: list[Row] = []
     where = torch.cuda.get_device_name() if device != "cpu" else "cpu"
-    for row, needed, check, arguments in checks:
-        found: Row = {"result": "no time left"}
-        if time.monotonic() + needed <= deadline:
-            try:
-                found = in_own_process(partial(check, *arguments))
-            except Exception as error:  # such as a memory that is full: the next check may pass
-                found = {"result": f"{type(error).__name__}: {str(error).splitlines()[0][:120]}"}
-        rows.append({**row, **found})
-        save(args.output, rows, device=where)
+    with tempfile.TemporaryDirectory() as folder:
+        for n, mode, policy in itertools.product(sorted(args.num_envs), args.modes, (False, True)):
+            row = {"check": "speed, policy inside" if policy else "speed, actions given", "mode": mode, "num_envs": n}
+            turn = Path(folder) / str(len(checks))
+            checks.append((row, late, speed, (device, mode, n, args.horizon, policy, turn, late)))
+        with ThreadPoolExecutor(len(checks)) as pool:
+            running = [pool.submit(in_own_process, partial(check, *given)) for _, _, check, given in checks]
+            for number, ((row, until, *_), result) in enumerate(zip(checks, running, strict=True)):
+                Path(folder, str(number)).touch()
+                try:
+                    found = result.result(max(0.0, until - time.time()))
+                except TimeoutError:
+                    found = {"result": "no time left"}
+                except Exception as error:  # such as a memory that is full: the others may pass
+                    found = {"result": str(error).splitlines()[0][:140]}
+                rows.append({**row, **found})
+                save(args.output, rows, device=where)
+            for process in multiprocessing.active_children():
+                process.kill()
     if failed := [row["check"] for row in rows if row["result"] not in ("ok", "no time left")]:
         raise SystemExit(f"Not ok: {', '.join(failed)}.")
 

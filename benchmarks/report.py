@@ -57,4 +57,11 @@ def publish(output: Path, page: Path, text: str) -> None:
 def in_own_process(function: Callable[..., Any], *arguments: Any) -> Any:
     """What a function returns in a fresh process, whose memory and modules are its own."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(function, *arguments).result()
+        return pool.submit(_told, function, *arguments).result()
+
+
+def _told(function: Callable[..., Any], *arguments: Any) -> Any:
+    try:
+        return function(*arguments)
+    except Exception as error:  # a compiler's holds its graph, which no pipe carries
+        raise RuntimeError(f"{type(error).__name__}: {error}") from None

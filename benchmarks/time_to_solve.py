@@ -29,18 +29,24 @@ def solve(algorithm: str, seed: int, overrides: list[str], cache: Path, limit: f
         metrics = Path(folder) / "run" / "metrics.csv"
         command = [sys.executable, str(RECIPES / f"{algorithm}.py"), f"seed={seed}", f"hydra.run.dir={metrics.parent}"]
         start = time.perf_counter()
-        with subprocess.Popen(
-            [*command, *overrides],
-            env={**os.environ, "TORCHINDUCTOR_CACHE_DIR": str(cache)},
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        ) as run:
+        with (
+            tempfile.TemporaryFile("w+") as said,
+            subprocess.Popen(
+                [*command, *overrides],
+                env={**os.environ, "TORCHINDUCTOR_CACHE_DIR": str(cache)},
+                stdout=subprocess.DEVNULL,
+                stderr=said,
+            ) as run,
+        ):
             while True:
                 ended = run.poll() is not None
                 if any(float(row["eval/solved"] or "nan") >= 0.99 for row in read_rows(metrics)):
                     seconds = time.perf_counter() - start
                     run.kill()
                     return seconds
+                if run.returncode:
+                    said.seek(0)
+                    raise RuntimeError(said.read().strip().splitlines()[-1])
                 if ended or time.perf_counter() - start > limit:
                     run.kill()
                     return None

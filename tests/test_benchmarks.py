@@ -94,15 +94,16 @@ def test_the_benchmark_of_a_gpu_runs_on_the_cpu_writes_each_row_and_names_what_f
         monkeypatch.setattr(module.subprocess, "run", lambda command, **options: [commands.append(command), ended][1])
 
     small = "--device cpu --num-envs 2 4 --modes eager --check-envs 2 --horizon 2 --seconds"
-    with pytest.raises(SystemExit, match=r"Not ok: checkpoint to CPU, hovering solved, racing solved\."):
+    with pytest.raises(SystemExit, match=r"Not ok: checkpoint to CPU, hovering solved\."):
         run("gpu", f"{small} 480", without_processes)
     rows = read_rows(Path("results.csv"))
-    assert [row["result"] for row in rows] == ["ok"] * 4 + ["Error: it failed.", "not solved", "not solved"] + [
-        "ok"
-    ] * 2
-    assert saved == list(range(1, 10)) and float(rows[0]["gradients"]) == 0 and "device=cpu" in commands[0]
+    assert [row["result"] for row in rows] == ["ok", "Error: it failed.", "not solved"] + ["ok"] * 4
+    assert saved == list(range(1, 8)) and float(rows[0]["gradients"]) == 0 and "device=cpu" in commands[0]
     assert all(0 < float(row["forward, of bound"]) < 1 for row in rows if row["check"].startswith("speed"))
-    assert {row["result"] for row in run("gpu", f"{small} 0", without_processes)} == {"no time left"}
+    with pytest.raises(SystemExit):
+        run("gpu", f"{small} 0", without_processes)
+    late = [row["result"] for row in read_rows(Path("results.csv")) if row["check"].startswith("speed")]
+    assert late == ["no time left"] * 4
 
 
 def test_the_benchmark_of_controllers_writes_a_table(run, monkeypatch):
@@ -127,7 +128,7 @@ def test_the_least_time_of_a_point_mass_is_the_one_worked_by_hand_and_below_ever
 def test_the_results_that_are_published_name_their_machine():
     published = list((BENCHMARKS / "results").glob("*.csv"))
     programs = {path.stem.removesuffix("_recipes") for path in BENCHMARKS.glob("*.py")}
-    programs -= {"laps", "lap_bound", "report", "gpu"}
+    programs -= {"laps", "lap_bound", "report"}
     assert {path.stem for path in published} == programs | {"transfer"}
     for path in published:
         assert all(row["machine"] for row in read_rows(path))

@@ -23,6 +23,7 @@ from torchrl_quad import (
 )
 from torchrl_quad.dynamics import DYNAMICS, PointMass
 from torchrl_quad.envs import TASKS
+from torchrl_quad.errors import Unsupported
 
 EVERYTHING = {
     "action_delay": 2,
@@ -256,6 +257,14 @@ def test_without_a_cpp_compiler_the_step_stays_eager_and_says_so(monkeypatch):
     with torch._dynamo.config.patch(disable=True):  # as TORCH_COMPILE_DISABLE=1 does
         assert not HoveringEnv(num_envs=2, compile=True).is_compiled
     assert env.rollout(2)["next", "reward"].isfinite().all()
+
+
+@pytest.mark.parametrize("options", [{"mode": "reduce-overhead"}, {"options": {"triton.cudagraphs": True}}])
+def test_cuda_graphs_are_refused_since_a_horizon_keeps_all_of_its_steps(options):
+    env = HoveringEnv(num_envs=2)
+    with pytest.raises(Unsupported, match="max-autotune-no-cudagraphs"):
+        env.compile(**options)
+    assert env.compile(mode="max-autotune-no-cudagraphs").is_compiled
 
 
 @pytest.mark.parametrize("kind", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])

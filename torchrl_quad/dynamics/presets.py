@@ -6,7 +6,7 @@ import numbers
 import re
 import tomllib
 from collections.abc import Hashable, Mapping, Sequence
-from importlib.abc import Traversable
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 

@@ -16,6 +16,7 @@ from torchrl_quad.engine.program import PolicyProgram, StepProgram, name_in_stat
 from torchrl_quad.engine.simulation import Simulation, State, Transition
 from torchrl_quad.errors import Unsupported
 
+_GRAPHS = ("reduce-overhead", "max-autotune")  # the modes of torch.compile that launch CUDA graphs
 LEARNING_BATCH = 1024  # so many steps of one drone make a batch for the gradient of the weights
 
 
@@ -31,6 +32,11 @@ class Stepper:
     """Steps a simulation, on entries or on rows; ``options`` are those of ``torch.compile``, None for eager."""
 
     def __init__(self, simulation: Simulation, options: dict[str, Any] | None = None) -> None:
+        if options and (options.get("mode") in _GRAPHS or options.get("options", {}).get("triton.cudagraphs")):
+            raise Unsupported(
+                "compile: CUDA graphs overwrite what a step returned when the next one begins, and a horizon keeps all "
+                'of its steps. Leave mode out, or write mode="max-autotune-no-cudagraphs".'
+            )
         self.simulation, self.options = simulation, options
         state, outputs = simulation.example()
         self.layout = Layout(state)

@@ -11,7 +11,7 @@ class Perch(LandingEnv):
 
     defaults, success_height = {"drone": "small_racer"}, 10.0
     target, start_centre, start_range = (1.0, 0.0, 1.5), (-1.5, 0.0, 1.5), 0.5
-    weights = {"survival": 0.02, "lean": 0.02, "slip": 0.008, "spin": 0.001, "touch": 20.0}  # to wait pays less
+    weights = {"survival": 0.02, "lean": 0.02, "slip": 0.012, "spin": 0.001, "touch": 20.0}  # to wait pays less
 
     def lean(self, state):  # how far the body's z axis is from where it should point, up and away from the wall
         return norm(rotate(state["quaternion"], self.tensor([[0.0, 0.0, 1.0]])) - self.tensor([-(0.75**0.5), 0.0, 0.5]))
@@ -22,9 +22,9 @@ class Perch(LandingEnv):
 
     def reward_terms(self, state):
         near, way = (5.0 * state["position"][..., :1]).clamp_max(0.0).exp(), state["target"] - state["position"]
-        errors = {"lean": near * self.lean(state), "slip": state["velocity"] - shortened(way, 1.5)}
+        costs = penalties(self.weights, slip=state["velocity"] - shortened(way, 1.5), spin=state["angular_velocity"])
         touch = self.touch(state) * (state["position"][..., :1] > 0)
-        return {**penalties(self.weights, **errors, spin=state["angular_velocity"]), "touch": touch}
+        return {**costs, "lean": self.weights["lean"] * near * (1.0 - self.lean(state)), "touch": touch}
 
     def events(self, previous, state):
         time = level_crossing(-previous["position"][..., :1], -state["position"][..., :1], 0.0)

@@ -243,6 +243,7 @@ def test_half_and_twice_a_rate_fly_once_and_are_judged_by_their_worst_seed(flown
     assert tables.rates_table(tmp_path) == [{"": "BPTT", "hovering": "50/?/90"}]
     assert flights.scaled("racing", "ppo", "2") == ["actor.lr=0.012", "actor.final_lr=2e-05"]
     assert flights.scaled("hovering", "hybrid", "0.5") == ["actor.max_kl=0.125"]
+    assert flights.scaled("hovering", "train", "2") == ["actor.lr=0.02"]
 
 
 def test_policies_of_the_forest_are_flown_at_the_speeds_and_densities_and_not_twice(flown, monkeypatch, tmp_path):

@@ -151,7 +151,7 @@ def drones(args: Namespace) -> None:
 
 def scaled(task: str, method: str, factor: str) -> list[str]:
     """Multiply the learning rates of the policy, from first to last, or the bound on its KL that sets them."""
-    names = ["actor.max_kl"] if method in ("hybrid", "train") else ["actor.lr", "actor.final_lr"]
+    names = {"hybrid": ["actor.max_kl"], "train": ["actor.lr"]}.get(method, ["actor.lr", "actor.final_lr"])
     cfg = shipped_configuration(task, method)
     return [f"{name}={float(factor) * OmegaConf.select(cfg, name):g}" for name in names]
 

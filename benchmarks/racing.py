@@ -82,7 +82,7 @@ def table(rows: list[dict[str, str]]) -> str:
 
 
 def main() -> None:
-    options = {"tracks": TRACKS, "seeds": [0], "drone": "kingfisher", "recipe": "ahac", "steps": 8_192_000}
+    options = {"tracks": TRACKS, "seeds": [0], "drone": "kingfisher", "recipe": "ahac", "steps": 3_072_000}
     more = {"episodes": 256, "cores": os.cpu_count() or 1, "runs": "outputs/ladder"}
     more["overrides"] = ["tuned=ahac_racing_tracks"]
     args = command_line(__doc__, "racing.csv", **options, **more)

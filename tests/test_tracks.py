@@ -84,11 +84,8 @@ def test_a_drone_that_could_hardly_stop_before_a_crash_pays_and_the_cost_pushes_
     (push,) = torch.autograd.grad(cost.sum(), state["position"])
     torch.testing.assert_close(push[3], torch.tensor([-0.5, -0.5, 0.0]).double())
     assert push[0, 0] < 0.0 and push[5, 1] > 0.0 and not push[[1, 2, 4]].any()
-    state["position"] = torch.tensor([[0, -1.7, 3]]).double().expand(6, 3)
-    near = env.reward_terms(state)["clearance"][0]  # 0.3 m before the sphere
-    torch.testing.assert_close(near, torch.tensor([-0.1 * math.log(2.0) / 3.0]).double())
     assert "closing" in RacingEnv(track={"gates": BOTH_WAYS, **OPEN}).reset()["reward_terms"]
-    assert not {"closing", "clearance"} & set(RacingEnv(track={"gates": gates}).reset()["reward_terms"].keys())
+    assert "closing" not in RacingEnv(track={"gates": gates}).reset()["reward_terms"]
 
 
 def test_touching_a_frame_is_a_crash_from_wherever_it_comes():

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, cast
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.nn.functional import softplus
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.engine.packing import Key
@@ -17,7 +18,7 @@ from torchrl_quad.envs.markers import Markers
 from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, first_episode, read
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenes import ELSEWHERE, MAX_OBSTACLES, Scene, left_out
-from torchrl_quad.envs.terms import nearness, norm, outside
+from torchrl_quad.envs.terms import norm, outside
 from torchrl_quad.errors import UserTypeError, UserValueError
 from torchrl_quad.options import Size, between, checked, entries
 
@@ -164,7 +165,7 @@ class ForestEnv(QuadrotorEnv):
         terms = {
             # 0.0099 is that of 0.1 m/s, the least command but for the last metre before the target, outside the forest.
             "speed": 1.0 - _gentle(velocity - command) / _gentle(command).clamp_min(0.0099),
-            "clearance": -nearness(distance, self.margin, self.softness),
+            "clearance": -self.softness * softplus((self.margin - distance) / self.softness) / self.margin,
             "closing": -closing * torch.exp(-distance.clamp_min(0.0) / self.nearness),
             "smoothness": -state["angular_velocity"].square().sum(-1, keepdim=True),
             "heading": self.heading(state) - 1.0,

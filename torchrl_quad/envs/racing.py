@@ -65,8 +65,7 @@ class RacingEnv(QuadrotorEnv):
     crosses the plane of the gate elsewhere, or touches a frame, takes up to a bonus away, tanh(m) of it at m [m] from
     half of the opening. A drone pays 0.5 log(a / 15) for each side of the box ahead, and for the nearest obstacle, that
     takes a > 15 m/s2 to stop before, a = v^2 / (2 d) with the speed v towards it and the distance d, since a crash has
-    no gradient; with spheres, too, by ``weights={"closing": 0.5}``. It pays 0.1 log(1 + exp((0.3 - d) / 0.1)) / 3 for
-    an obstacle at d [m], so that it finds ways around.
+    no gradient; with spheres, too, by ``weights={"closing": 0.5}``.
 
     A point is passed when the straight line of a control step comes within 0.3 m of it, a gate with a direction when
     that line crosses its plane, from behind, within its opening. The reward of that step is about the gate after it.
@@ -154,7 +153,7 @@ class RacingEnv(QuadrotorEnv):
         self.ends_on_success = not self.is_closed
         self.start_range = self.track.get("start_range", self.start_range)
         self.weights = {**WEIGHTS[reward], **RELAXATION_WEIGHTS.get(gate_bonus, {})}
-        self.weights |= {"closing": 0.0 if "gate_radius" in self.track else 0.5, "clearance": 0.1}
+        self.weights["closing"] = 0.0 if "gate_radius" in self.track else 0.5
         if "scene" in self.track and kwargs.get("scene") is None:
             kwargs["scene"] = self.track["scene"]
         super().__init__(num_envs, max_episode_steps=max_episode_steps, **kwargs)
@@ -375,17 +374,15 @@ class RacingEnv(QuadrotorEnv):
                 "across": -self.weights["across"] * across / (gap + 1.0),
                 "angular_velocity": -self.weights["angular_velocity"] * terms.norm(state["angular_velocity"]),
             }
-        nearest = None if self.scene is None else self.scene.nearest(world)  # how far, and the direction away
         if self.weights["closing"]:
             place, velocity = world["position"] - self.centre, world["velocity"]
             room, speed = self.half_box - torch.where(velocity > 0.0, place, -place), velocity
-            if nearest is not None:
-                closing = -(nearest[1] * velocity).sum(-1, keepdim=True)
-                room, speed = torch.cat((room, nearest[0]), -1), torch.cat((speed, closing.clamp_min(0.0)), -1)
+            if self.scene is not None:
+                distance, away = self.scene.nearest(world)
+                closing = -(away * velocity).sum(-1, keepdim=True)
+                room, speed = torch.cat((room, distance), -1), torch.cat((speed, closing.clamp_min(0.0)), -1)
             needed = speed.square() / (2.0 * BRAKING * room.clamp_min(LEAST_ROOM))
             rewards["closing"] = -self.weights["closing"] * needed.clamp_min(1.0).log().sum(-1, keepdim=True)
-        if nearest is not None:
-            rewards["clearance"] = -self.weights["clearance"] * terms.nearness(nearest[0])
         if self.gate_bonus != "binary":
             bonus = -torch.log(gap + 0.01) if self.gate_bonus == "log" else 1.0 / (gap + 0.05)
         return {**rewards, "gate": self.weights["gate"] * bonus}

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 from torch.linalg import vector_norm
-from torch.nn.functional import softplus
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.engine.simulation import State
@@ -63,12 +62,6 @@ def penalties(weights: Mapping[str, float], **errors: Tensor) -> dict[str, Tenso
     """The terms of "make these errors (*, k) small", each (*, 1): ``survival``, and minus the length of each error."""
     survival = torch.full_like(next(iter(errors.values()))[..., :1], weights["survival"])
     return {"survival": survival, **{name: -weights[name] * norm(x) for name, x in errors.items()}}
-
-
-def nearness(distance: Tensor, margin: float = 0.3, softness: float = 0.1) -> Tensor:
-    """A cost of distances to obstacles [m] within a margin [m], about 1 at zero: softness log(1 + exp((margin - d) /
-    softness)) / margin."""
-    return softness * softplus((margin - distance) / softness) / margin
 
 
 def outside(position: Tensor, centre: Tensor, half_width: Tensor | float, height: float, floor: float = 0.0) -> Tensor:

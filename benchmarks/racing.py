@@ -67,11 +67,16 @@ def judge(folder: Path, track: str, drone: str, episodes: int) -> dict[str, floa
 
 
 def table(rows: list[dict[str, str]]) -> str:
-    """Give the table of the page; what differs from seed to seed from the least to the greatest."""
+    """The table of the page: for each track the steps that solved the most, seeds from the least to the greatest."""
     columns = {"success": "success", "lap_time": "lap [s]", "bound": "bound [s]", "ratio": "lap / bound"}
     lines = [[*KEY[:-1], "seeds", *columns.values()], ["---"] * (len(KEY) + len(columns))]
-    for run_of in dict.fromkeys(tuple(row[name] for name in KEY[:-1]) for row in rows):
-        some = [row for row in rows if tuple(row[name] for name in KEY[:-1]) == run_of]
+    runs: dict[tuple[str, ...], list[dict[str, str]]] = {}
+    for row in rows:
+        runs.setdefault(tuple(row[name] for name in KEY[:-1]), []).append(row)
+    solved = {run_of: sum(float(row["success"]) for row in some) / len(some) for run_of, some in runs.items()}
+    for run_of, some in runs.items():
+        if solved[run_of] < max(share for other, share in solved.items() if other[:-1] == run_of[:-1]):
+            continue
         lines.append([*run_of, str(len(some))])
         for name in columns:
             values = sorted(value for row in some if not math.isnan(value := float(row[name])))

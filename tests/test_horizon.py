@@ -264,7 +264,7 @@ def test_cuda_graphs_are_refused_since_a_horizon_keeps_all_of_its_steps(options)
     env = HoveringEnv(num_envs=2)
     with pytest.raises(Unsupported, match="max-autotune-no-cudagraphs"):
         env.compile(**options)
-    assert env.compile(mode="max-autotune-no-cudagraphs").is_compiled
+    assert env.compile(mode="max-autotune-no-cudagraphs", options=None).is_compiled
 
 
 @pytest.mark.parametrize("kind", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])

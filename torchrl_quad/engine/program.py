@@ -50,7 +50,7 @@ class Compiled:
 
     def __init__(self, method: types.MethodType, options: dict[str, Any]) -> None:
         mode = torch._inductor.list_mode_options(options["mode"]) if options.get("mode") else {}
-        self.patches = {"cpp.vec_isa_ok": True, **mode, **options.get("options", {})}
+        self.patches = {"cpp.vec_isa_ok": True, **mode, **(options.get("options") or {})}
         backend = options.get("backend", "inductor")
         self.backend = None if backend == "inductor" else torch._dynamo.lookup_backend(backend)
         given = {name: x for name, x in options.items() if name not in ("mode", "options", "backend")}

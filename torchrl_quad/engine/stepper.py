@@ -32,7 +32,7 @@ class Stepper:
     """Steps a simulation, on entries or on rows; ``options`` are those of ``torch.compile``, None for eager."""
 
     def __init__(self, simulation: Simulation, options: dict[str, Any] | None = None) -> None:
-        if options and (options.get("mode") in _GRAPHS or options.get("options", {}).get("triton.cudagraphs")):
+        if options and (options.get("mode") in _GRAPHS or (options.get("options") or {}).get("triton.cudagraphs")):
             raise Unsupported(
                 "compile: CUDA graphs overwrite what a step returned when the next one begins, and a horizon keeps all "
                 'of its steps. Leave mode out, or write mode="max-autotune-no-cudagraphs".'

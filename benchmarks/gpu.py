@@ -102,7 +102,7 @@ def checkpoint(device: str) -> Row:
         for command in (run, judge):
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             if done.returncode:
-                return {"result": done.stderr.strip().splitlines()[-1]}
+                return {"result": (done.stderr.strip() or f"ended with {done.returncode}").splitlines()[-1]}
     return {"result": "ok"}
 
 

@@ -46,7 +46,8 @@ def solve(algorithm: str, seed: int, overrides: list[str], cache: Path, limit: f
                     return seconds
                 if run.returncode:
                     said.seek(0)
-                    raise RuntimeError(said.read().strip().splitlines()[-1])
+                    last = " ".join(said.read().strip().splitlines()[-1:])
+                    raise RuntimeError(f"{algorithm} ended with {run.returncode}: {last}")
                 if ended or time.perf_counter() - start > limit:
                     run.kill()
                     return None

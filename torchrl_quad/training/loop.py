@@ -124,9 +124,7 @@ class Run:
         logger_state = self._load(Path(cfg.resume)) if cfg.resume else None
         if not cfg.resume:
             self.carry = env.reset()
-        self.evaluated = (
-            self.rows[-1]["iteration"] if self.rows else 0
-        )  # all processes know when; the first has the rows
+        self.evaluated = self.rows[-1]["iteration"] if self.rows else 0  # known to all processes, as rows are not
         self.looks_ahead = looks_ahead(self.rows, cfg.eval.patience)
         self.levelled_off = has_levelled_off(self.rows, cfg.eval.patience)
         self.is_over = not self.goes_on and (self.folder / "summary.json").exists()

@@ -88,6 +88,37 @@ def test_a_drone_that_could_hardly_stop_before_a_crash_pays_and_the_cost_pushes_
     assert "closing" not in RacingEnv(track={"gates": gates}).reset()["reward_terms"]
 
 
+def test_the_reward_leads_around_poles_and_frames_that_are_in_the_way():
+    scene = {"cylinders": [{"base": [-2, 0, 0], "radius": 0.1, "height": 6.0}], "drone_radius": 0.1}
+    gate = {"position": [0, 0, 3], "yaw": 0.0, "width": 1.0, "height": 1.0}
+    track = {"gates": [gate, {**gate, "position": [8, 0, 3]}], "frame": 0.2, "scene": scene}
+    env = RacingEnv(num_envs=5, track=track, dtype=torch.float64)
+    env.drone_radius, state = 0.1, dict(env.reset()["state"].items())
+    # Before the pole, a little to its left; behind the upper bar; beside the pole; past it; and in the opening.
+    start = torch.tensor([[-4, 0.02, 3], [1, 0, 3.63], [-4, 0.5, 3], [-1.5, 0, 3], [-0.5, 0.1, 3]]).double()
+    end = torch.tensor([[-1, 0, 3], [-1, 0, 3.63], [-1, 0.5, 3], [0, 0, 3], [0, 0, 3]]).double()
+    ahead, gap = torch.nn.functional.normalize(end - start, dim=-1), (end - start).norm(dim=-1, keepdim=True)
+    around = env.around({**state, "position": start}, ahead, gap)
+    torch.testing.assert_close(around.norm(dim=-1), torch.ones(5).double())
+    assert torch.equal(around[2:4], ahead[2:4])
+    share = torch.linspace(0.0, 1.0, 1001).double().reshape(-1, 1)
+    distance = env.obstacle(state, start.unsqueeze(1) + share * (gap * around).unsqueeze(1))[0].amin((1, 2))
+    assert (distance[:2] > 0.1).all() and around[0, 1] > 0.05 and around[0, 2] == 0.0  # left, and not up the pole
+    straight = env.obstacle(state, start.unsqueeze(1) + share * (gap * ahead).unsqueeze(1))[0].amin((1, 2))
+    assert (straight[:2] < 0.0).all() and around[1, 2] > 0.05  # the nearer way out is above
+
+    points = torch.randn(1, 400, 3).double() + torch.tensor([0.0, 0.0, 3.0])
+    found, away = env.obstacle(state, points.requires_grad_())
+    torch.testing.assert_close(torch.autograd.grad(found.sum(), points)[0], away)
+    aside = torch.cartesian_prod(*2 * [torch.linspace(-0.7, 0.7, 141).double()])  # of points on the bars
+    aside = aside[aside.abs().amax(-1) >= 0.5 - 1e-9]
+    bars = torch.cat([torch.nn.functional.pad(aside, (1, 0), value=x) for x in (0.01 * k for k in range(-10, 11))])
+    frames = torch.cat([bars + torch.tensor(x["position"]) for x in track["gates"]])
+    pole = (points[..., :2] - torch.tensor([-2.0, 0.0])).norm(dim=-1) - 0.1
+    least = torch.minimum(torch.cdist(points[0], frames).amin(1), pole[0]) - 0.1
+    torch.testing.assert_close(found[0, :, 0].clamp_min(-0.1), least, rtol=0.0, atol=0.01)  # within a bar: negative
+
+
 def test_touching_a_frame_is_a_crash_from_wherever_it_comes():
     position = torch.tensor([[-0.1, 0, 3], [-0.1, 1.05, 3], [0, 0, 3.9], [-0.1, 2, 3], [-0.1, 0, 3.4], [0.5, 1.1, 3]])
     velocity = torch.tensor([[10.0, 0, 0], [10, 0, 0], [0, 0, -10], [10, 0, 0], [10, 0, 0], [0, 10, 0]])

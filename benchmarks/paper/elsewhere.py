@@ -4,7 +4,7 @@ The pendulum is TorchRL's, for 200 steps; random actions reach about -1200, and 
 Balance is a task of VMAS (Bettini et al. 2022, arXiv:2207.03530; ``pip install vmas``): three agents carry a bar with a
 ball on it to a goal, by contact; the reward is a hundred times the way that the ball comes closer, and -10 if it falls.
 
-All losses have the same networks, rates and number of steps; the hybrid and PPO have the settings of their recipes.
+All losses have the same networks, rates and number of steps; the hybrid, PPO and train.py have those of their recipes.
 """
 
 from __future__ import annotations
@@ -13,11 +13,13 @@ import time
 from argparse import Namespace
 from collections.abc import Callable, Iterable
 from itertools import product
+from typing import cast
 
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.optim.swa_utils import AveragedModel
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import Compose, PendulumEnv, RewardScaling, Transform, TransformedEnv, VmasEnv
 from torchrl.envs.utils import ExplorationType
@@ -29,7 +31,17 @@ from benchmarks.paper.flights import about
 from benchmarks.paper.running import composed, kept
 from torchrl_quad import differentiable_rollout, make_actor, make_qvalue, make_value, objectives
 from torchrl_quad.files import add_rows
-from torchrl_quad.training.building import AdaptiveOptimizer, Optimizer, make_policy, network, shuffled
+from torchrl_quad.training.building import (
+    AdaptiveOptimizer,
+    Optimizer,
+    ReturnScale,
+    average_policy,
+    make_loss,
+    make_policy,
+    minibatches,
+    network,
+    shuffled,
+)
 from torchrl_quad.training.loop import backward
 
 ENVS, HORIZON, EPISODE, EPISODES = 256, 16, 200, 256
@@ -43,7 +55,7 @@ LOSSES = {
     "abpt": lambda env, actor: objectives.ABPTLoss(actor, make_qvalue(env)),
     "abpt-simulated": lambda env, actor: objectives.ABPTLoss(actor, make_qvalue(env), simulated_steps=1),
 }
-NAMES = (*LOSSES, "hybrid", "ppo")
+NAMES = (*LOSSES, "hybrid", "ppo", "train")
 
 
 class CosSin(Transform):
@@ -217,14 +229,14 @@ def set_up(
 ) -> tuple[DictConfig, Pendulum | Balance, ProbabilisticActor, ValueOperator]:
     """Compose the configuration of a recipe, and build its environment and networks."""
     torch.manual_seed(seed)
-    cfg = composed(algorithm, [f"num_envs={min(128, ENVS)}", f"total_steps={STEPS}", *overrides])
+    cfg = composed(algorithm, [f"total_steps={STEPS}", *overrides])
     place = ENVIRONMENTS[environment](seed, cfg.num_envs)
     return cfg, place, make_policy(cfg, place.env), make_value(place.env, **network(cfg, "critic"))
 
 
 def train_hybrid(environment: str, seed: int) -> tuple[float, float, float]:
     """Train with the settings and the loop of recipes/hybrid.py."""
-    cfg, place, actor, value = set_up("hybrid", environment, seed)
+    cfg, place, actor, value = set_up("hybrid", environment, seed, f"num_envs={min(128, ENVS)}")
     loss = objectives.HybridLoss(actor, value, **cfg.loss)
     loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
     actor_optimizer, critic_optimizer = AdaptiveOptimizer(cfg, "actor", loss), Optimizer(cfg, "critic", loss)
@@ -246,7 +258,8 @@ def train_hybrid(environment: str, seed: int) -> tuple[float, float, float]:
 
 def train_ppo(environment: str, seed: int) -> tuple[float, float, float]:
     """Train with the loop of recipes/ppo.py, its settings for racing, and the horizons of the hybrid."""
-    cfg, place, actor, value = set_up("ppo", environment, seed, "tuned=ppo_racing", "horizon=32", "batch_size=1024")
+    more = (f"num_envs={min(128, ENVS)}", "tuned=ppo_racing", "horizon=32", "batch_size=1024")
+    cfg, place, actor, value = set_up("ppo", environment, seed, *more)
     advantage = GAE(gamma=cfg.gamma, lmbda=cfg.critic.lmbda, value_network=value, vectorized=False)
     loss = ClipPPOLoss(actor, value, **cfg.loss)
     actor_optimizer, critic_optimizer = Optimizer(cfg, "actor", actor), Optimizer(cfg, "critic", value)
@@ -268,7 +281,32 @@ def train_ppo(environment: str, seed: int) -> tuple[float, float, float]:
     return learn(environment, place, actor, iterate, (actor_optimizer, critic_optimizer))
 
 
-OWN_LOOPS = {"hybrid": train_hybrid, "ppo": train_ppo}
+def train_one_setting(environment: str, seed: int) -> tuple[float, float, float]:
+    """Train with the settings and the loop of recipes/train.py, and its near discount: nothing here is ever solved."""
+    cfg, place, actor, _ = set_up("train", environment, seed)
+    loss = make_loss(objectives.AHACLoss, cfg, place.env, actor, make_value, horizon=cfg.horizon)
+    loss.value_estimator.gamma.fill_(2.0 * cfg.gamma - 1.0)
+    actor_optimizer, critic_optimizer = Optimizer(cfg, "actor", loss), Optimizer(cfg, "critic", loss)
+    scale, average = ReturnScale(loss), cast("AveragedModel", average_policy(cfg, actor))
+
+    def iterate(_: float, carry: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        rollout, carry = differentiable_rollout(place.env, actor, carry, loss.horizon)
+        scale.divide(rollout)
+        loss_actor, metrics = loss.loss_actor(rollout)
+        if backward(loss_actor, actor_optimizer, cfg.actor.max_grad_norm)[1].isfinite():
+            actor_optimizer.step()
+        average.update_parameters(actor)
+        data = loss.write_value_target(rollout.detach())
+        scale.update(data)
+        for batch in minibatches(data, cfg.critic):
+            optimise(critic_optimizer, loss.loss_value(batch)[0], cfg.critic.max_grad_norm)
+        loss.adapt_horizon(metrics["stiffness"])
+        return rollout, carry
+
+    return learn(environment, place, average.module, iterate, (actor_optimizer, critic_optimizer))
+
+
+OWN_LOOPS = {"hybrid": train_hybrid, "ppo": train_ppo, "train": train_one_setting}
 
 
 def elsewhere(args: Namespace) -> None:

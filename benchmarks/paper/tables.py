@@ -41,6 +41,7 @@ def make(data: Path) -> dict[str, Table]:
         "forest": forest_table(data),
         "elsewhere": elsewhere_table(data),
         "tracks": reached_tables(read_rows(data / "tracks.csv"), starts)["reached"],
+        "one_setting": reached_tables(read_rows(data / "one_setting.csv"), starts)["reached_in_full"],
     }
     if results.all_finals or results.curves:
         own, published = try_all(data)

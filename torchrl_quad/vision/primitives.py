@@ -57,19 +57,21 @@ def distances(solids: Primitives, points: Tensor) -> Tensor:
 
 
 def nearest(solids: Primitives, position: Tensor) -> tuple[Tensor, Tensor]:
-    """Signed distance (n, 1) [m] from positions (n, 3) to the nearest surface, and the direction (n, 3) away from it.
+    """Signed distance (*, 1) [m] from positions (n, 3), or (n, k, 3), to the nearest surface, and the direction (*, 3)
+    away from it.
 
     The direction is the gradient of the distance. Both are differentiable in the position.
     """
     found, away = [], []
     for (distance, normal), x in zip(KINDS.values(), solids, strict=True):
         if x.shape[1]:
-            found.append(distance(x, position.unsqueeze(1)))
-            parts = torch.broadcast_tensors(*normal(x, position.unsqueeze(1)), found[-1])[:3]
-            away.append(torch.stack(parts, -1))
-    found, away = torch.cat(found, 1), torch.cat(away, 1)
-    index = found.argmin(1, keepdim=True)
-    return found.gather(1, index), away.gather(1, index.unsqueeze(-1).expand(-1, -1, 3)).squeeze(1)
+            own, point = x if position.dim() == 2 else x.unsqueeze(1), position.unsqueeze(-2)
+            found.append(distance(own, point))
+            away.append(torch.stack(torch.broadcast_tensors(*normal(own, point), found[-1])[:3], -1))
+    found, away = torch.cat(found, -1), torch.cat(away, -2)
+    index = found.argmin(-1, keepdim=True)
+    of = index.unsqueeze(-1).expand(*(-1 for _ in index.shape), 3)
+    return found.gather(-1, index), away.gather(-2, of).squeeze(-2)
 
 
 def closest_approach(solids: Primitives, start: Tensor, end: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """Gates with a shape and a direction, tracks of other projects, and tracks that each episode draws."""
 
+import functools
 import math
 
 import numpy as np
@@ -10,6 +11,7 @@ from refusals import cases, refuses
 from torchrl.envs import check_env_specs
 
 from torchrl_quad import RacingEnv, load_track, random_track
+from torchrl_quad.envs.gates import around, bar_distance, beyond_edges
 from torchrl_quad.envs.track import forward
 
 OPEN = {"width": 2.0, "height": 1.0}
@@ -88,35 +90,57 @@ def test_a_drone_that_could_hardly_stop_before_a_crash_pays_and_the_cost_pushes_
     assert "closing" not in RacingEnv(track={"gates": gates}).reset()["reward_terms"]
 
 
-def test_the_reward_leads_around_poles_and_frames_that_are_in_the_way():
-    scene = {"cylinders": [{"base": [-2, 0, 0], "radius": 0.1, "height": 6.0}], "drone_radius": 0.1}
-    gate = {"position": [0, 0, 3], "yaw": 0.0, "width": 1.0, "height": 1.0}
-    track = {"gates": [gate, {**gate, "position": [8, 0, 3]}], "frame": 0.2, "scene": scene}
-    env = RacingEnv(num_envs=5, track=track, dtype=torch.float64)
-    env.drone_radius, state = 0.1, dict(env.reset()["state"].items())
-    # Before the pole, a little to its left; behind the upper bar; beside the pole; past it; and in the opening.
-    start = torch.tensor([[-4, 0.02, 3], [1, 0, 3.63], [-4, 0.5, 3], [-1.5, 0, 3], [-0.5, 0.1, 3]]).double()
-    end = torch.tensor([[-1, 0, 3], [-1, 0, 3.63], [-1, 0.5, 3], [0, 0, 3], [0, 0, 3]]).double()
-    ahead, gap = torch.nn.functional.normalize(end - start, dim=-1), (end - start).norm(dim=-1, keepdim=True)
-    around = env.around({**state, "position": start}, ahead, gap)
-    torch.testing.assert_close(around.norm(dim=-1), torch.ones(5).double())
-    assert torch.equal(around[2:4], ahead[2:4])
-    share = torch.linspace(0.0, 1.0, 1001).double().reshape(-1, 1)
-    distance = env.obstacle(state, start.unsqueeze(1) + share * (gap * around).unsqueeze(1))[0].amin((1, 2))
-    assert (distance[:2] > 0.1).all() and around[0, 1] > 0.05 and around[0, 2] == 0.0  # left, and not up the pole
-    straight = env.obstacle(state, start.unsqueeze(1) + share * (gap * ahead).unsqueeze(1))[0].amin((1, 2))
-    assert (straight[:2] < 0.0).all() and around[1, 2] > 0.05  # the nearer way out is above
+POLE = {"cylinders": [{"base": [-2, 0, 0], "radius": 0.1, "height": 6.0}], "drone_radius": 0.1}
+FOUR_SIDES, ROUND = {"width": 1.0, "height": 0.8}, {"radius": 0.5}
 
-    points = torch.randn(1, 400, 3).double() + torch.tensor([0.0, 0.0, 3.0])
-    found, away = env.obstacle(state, points.requires_grad_())
-    torch.testing.assert_close(torch.autograd.grad(found.sum(), points)[0], away)
-    aside = torch.cartesian_prod(*2 * [torch.linspace(-0.7, 0.7, 141).double()])  # of points on the bars
-    aside = aside[aside.abs().amax(-1) >= 0.5 - 1e-9]
-    bars = torch.cat([torch.nn.functional.pad(aside, (1, 0), value=x) for x in (0.01 * k for k in range(-10, 11))])
-    frames = torch.cat([bars + torch.tensor(x["position"]) for x in track["gates"]])
-    pole = (points[..., :2] - torch.tensor([-2.0, 0.0])).norm(dim=-1) - 0.1
-    least = torch.minimum(torch.cdist(points[0], frames).amin(1), pole[0]) - 0.1
-    torch.testing.assert_close(found[0, :, 0].clamp_min(-0.1), least, rtol=0.0, atol=0.01)  # within a bar: negative
+
+@cases(({"scene": POLE}, -8.0, -1.0), ({"frame": 0.05}, -4.0, 4.0), ({"frame": 0.2}, -6.0, 1.0))
+def test_the_reward_leads_around_poles_and_frames_that_are_in_the_way(more, start, end):
+    track = {"gates": [{"position": [0, 0, 3], "yaw": 0.0}, {"position": [12, 0, 3], "yaw": 0.0}], **FOUR_SIDES, **more}
+    env = RacingEnv(num_envs=400, track=track)
+    env.drone_radius, state = 0.1, dict(env.reset()["state"].items())
+    aside = torch.cat((torch.zeros(2, 400, 1), torch.rand(2, 400, 2) * 1.2 - 0.6), -1)
+    starts, ends = aside + torch.tensor([[[start, 0.0, 3.0]], [[end, 0.0, 3.0]]])
+    gap = (ends - starts).norm(dim=-1, keepdim=True)
+    ahead, least, place = (ends - starts) / gap, torch.full((400, 1), 9.0), starts
+    turned = around(starts, ahead, gap, 0.2, functools.partial(env.obstacle, state))
+    torch.testing.assert_close(turned.norm(dim=-1), torch.ones(400))
+    assert (turned * ahead).sum(-1).min() > 0.7  # at most 45 degrees
+    points = starts.unsqueeze(1) + torch.linspace(0.0, 1.0, 401).reshape(-1, 1) * (gap * ahead).unsqueeze(1)
+    straight = env.obstacle(state, points)[0].amin((1, 2))
+    assert torch.equal(turned[straight > 0.2], ahead[straight > 0.2])
+    for _ in range(200):  # fly where it leads
+        left = (ends - place).norm(dim=-1, keepdim=True).clamp_min(1e-3)
+        way = around(place, (ends - place) / left, left, 0.2, functools.partial(env.obstacle, state))
+        place = place + way * left.clamp_max(0.05)
+        least = least.minimum(env.obstacle(state, place.unsqueeze(1))[0][:, 0])
+    assert (place - ends).norm(dim=-1).max() < 0.1
+    assert (straight < 0.0).sum() > 40 and (least < 0.0).double().mean() < 0.01, (least < 0).sum()
+
+
+def test_a_pole_close_ahead_turns_the_reward_aside_and_one_behind_the_gate_does_not():
+    env = RacingEnv(num_envs=2, track={"gates": BOTH_WAYS, **OPEN, "scene": {**POLE}})
+    state = dict(env.reset()["state"].items())
+    start, ahead = torch.tensor([[-2.5, 0.03, 3.0], [-2.25, 0.0, 3.0]]), torch.tensor([[1.0, 0.0, 0.0]]).repeat(2, 1)
+    turned = around(start, ahead, torch.tensor([[6.0], [0.05]]), 0.2, functools.partial(env.obstacle, state))
+    assert turned[0, 1] > 0.5 and turned[0, 2] == 0.0  # to the left, and not up the pole
+    torch.testing.assert_close(turned[1], ahead[1])
+
+
+@cases((FOUR_SIDES,), (ROUND,))
+def test_the_distance_from_bars_is_that_from_their_points_and_the_direction_is_its_gradient(opening):
+    sizes = torch.tensor([[opening["radius"]] if "radius" in opening else [0.5, 0.4]])
+    special = [[0, 0, 0], [0, 1e-9, 0], [0, 0.3, 0.3], [0, 0.55, 0.55], [0, 0.55, 0.45], [1, 0, 0]]
+    place = torch.cat((torch.tensor(special), 0.5 * torch.randn(1000, 3))).requires_grad_()
+    found, away = bar_distance(place, sizes, 0.2)
+    (slope,) = torch.autograd.grad(found[6:].sum(), place)
+    torch.testing.assert_close(slope[6:], away[6:], rtol=1e-4, atol=1e-4)
+    grid = torch.cartesian_prod(torch.linspace(-0.1, 0.1, 21), *2 * [torch.linspace(-0.7, 0.7, 141)])
+    beyond = beyond_edges(grid[:, 1:], sizes)
+    bars = grid[((beyond > -1e-4).any(-1)) & (beyond < 0.2001).all(-1)]
+    least = torch.cdist(place.detach(), bars).amin(1, keepdim=True)
+    torch.testing.assert_close(found.clamp_min(0.0), least.where(found > 0.0, 0.0), rtol=0.0, atol=0.012)
+    assert (least[found < 0.0] < 0.012).all() and (found < 0.0).sum() > 5
 
 
 def test_touching_a_frame_is_a_crash_from_wherever_it_comes():

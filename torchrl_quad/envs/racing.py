@@ -1,19 +1,20 @@
 """The racing task."""
 
+import functools
 import math
 from typing import Annotated, Any, Literal
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torch.nn.functional import normalize, pad
+from torch.nn.functional import pad
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.engine.packing import Key
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs import terms
 from torchrl_quad.envs.base import QuadrotorEnv
-from torchrl_quad.envs.gates import least_distance, nearest_frame, outside
+from torchrl_quad.envs.gates import around, beyond_edges, least_distance, nearest_frame
 from torchrl_quad.envs.guard import MAX_STEPS
 from torchrl_quad.envs.markers import Markers, Shape, rims
 from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, first_episode, read
@@ -34,7 +35,6 @@ FUNNEL = 0.5  # how far before a gate the reward leads, as a share of the way to
 ROUND = 0.1  # [m], from the axis, where the way to it is rounded off
 SLOW = 1.0  # [m/s], towards a gate: slower drones are led back before its plane, since they would hang at it
 BRAKING, LEAST_ROOM = 15.0, 0.05  # [m/s2], what costs nothing; [m], below which nothing gets nearer
-LOOKS = 12  # places on the straight way ahead, at which obstacles are looked for
 CLEARANCE = 2.0  # how far from them the reward leads, in radii of the drone; as far as an opening allows
 
 
@@ -63,11 +63,11 @@ class RacingEnv(QuadrotorEnv):
     Where gates have a direction, d and v_a are about a point on the axis of the gate, before it by half of the drone's
     distance from the axis, and by the drone's way beyond the gate, which for a drone slower than 1 m/s begins up to
     half of the smallest opening before the gate; v_t is how fast the way over that point gets shorter. Where that way
-    passes an obstacle or a frame within two radii of the drone, v_t and v_a are about the direction that clears it. A
-    step that crosses the plane of the gate elsewhere, or touches a frame, takes up to a bonus away, tanh(m) of it at m
-    [m] from half of the opening. A drone pays 0.5 log(a / 15) for each side of the box ahead, and for the nearest
-    obstacle or frame, that takes a > 15 m/s2 to stop before, a = v^2 / (2 d) with the speed v towards it and the
-    distance d, since a crash has no gradient; with spheres, too, by ``weights={"closing": 0.5}``.
+    passes an obstacle, a frame or the ground of the scene within two radii of the drone, v_t and v_a are about the
+    direction that clears it. A step that crosses the plane of the gate elsewhere, or touches a frame, takes up to a
+    bonus away, tanh(m) of it at m [m] from half of the opening. A drone pays 0.5 log(a / 15) for each side of the box
+    ahead, and for the nearest obstacle, that takes a > 15 m/s2 to stop before, a = v^2 / (2 d) with the speed v towards
+    it and the distance d, since a crash has no gradient; with spheres, too, by ``weights={"closing": 0.5}``.
 
     A point is passed when the straight line of a control step comes within 0.3 m of it, a gate with a direction when
     that line crosses its plane, from behind, within its opening. The reward of that step is about the gate after it.
@@ -260,7 +260,7 @@ class RacingEnv(QuadrotorEnv):
         centre, rotation = self.pose(previous, previous["gate"])
         start, end = (quaternion.rotate_inverse(rotation, x["position"] - centre) for x in (previous, state))
         time = terms.level_crossing(-start[:, :1], -end[:, :1], 0.0)
-        off = outside(torch.lerp(start, end, time)[:, 1:], self.openings[previous["gate"][:, 0]])
+        off = beyond_edges(torch.lerp(start, end, time)[:, 1:], self.openings[previous["gate"][:, 0]])
         return time, (start[:, :1] < 0.0) & (end[:, :1] >= 0.0) & (off < 0.0).all(-1, keepdim=True)
 
     def obstacle(self, state: State, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -275,22 +275,6 @@ class RacingEnv(QuadrotorEnv):
         (distance, away), (other, away_from_it) = found
         return torch.minimum(distance, other), torch.where(distance < other, away, away_from_it)
 
-    def around(self, state: State, ahead: Tensor, gap: Tensor) -> Tensor:
-        """The direction (n, 3) that clears what the straight way ahead, of that direction and length, comes close to.
-
-        It aims beside the place where the way comes closest, by as much as it lacks there, and carries no gradient.
-        """
-        with torch.no_grad():
-            share, start = torch.arange(1, LOOKS + 1, device=self.device, dtype=self.dtype) / LOOKS, state["position"]
-            points = start.unsqueeze(1) + share.reshape(-1, 1) * (gap * ahead).unsqueeze(1)
-            distance, away = self.obstacle(state, points)
-            index = distance.argmin(1, keepdim=True)
-            point, away = (x.gather(1, index.expand(-1, -1, 3)).squeeze(1) for x in (points, away))
-            clearance = min(CLEARANCE * self.drone_radius, self.gate_radius - self.drone_radius)
-            lack = clearance - distance.amin(1)
-            way = normalize(point - start + lack * away, dim=-1)
-        return torch.where((lack > 0.0) & (index[:, 0] > 0), way, ahead)
-
     def advance(self, previous: State, state: State) -> State:
         gate, step = previous["gate"], state["step"]
         with torch.no_grad():  # how close to the gate the straight line between the two positions comes
@@ -304,8 +288,8 @@ class RacingEnv(QuadrotorEnv):
                 passed = terms.norm(start + fraction * line - centre) < self.gate_radius
             more = {}
             if self.frame:
-                way = previous["position"], state["position"]
-                distance = least_distance(*way, *self.poses(state), self.openings, self.frame)
+                start, end, poses = previous["position"], state["position"], self.poses(state)
+                distance = least_distance(start, end, *poses, self.openings, self.frame)
                 more = {"frame_touched": distance < self.drone_radius}
         this_gate = passed & (gate == self.gate_indices)
         last_pass = previous["pass_step"].gather(1, gate)
@@ -366,7 +350,7 @@ class RacingEnv(QuadrotorEnv):
         beyond = along + back - 2.0 * self.control_dt * speed.clamp_min(0.0)  # not in the step that crosses the plane
         before = FUNNEL * (off - ROUND) + beyond.clamp_min(0.0)
         growth = FUNNEL * (aside * velocity[:, 1:]).sum(-1, keepdim=True) / off + torch.where(beyond > 0.0, speed, 0.0)
-        beside = outside(aside, 0.5 * self.openings[state["gate"][:, 0]]).amax(-1, keepdim=True).clamp_min(0.0)
+        beside = beyond_edges(aside, 0.5 * self.openings[state["gate"][:, 0]]).amax(-1, keepdim=True).clamp_min(0.0)
         missed = (along >= 0.0) & (along < self.control_dt * speed)
         missed = missed | state["frame_touched"] if self.frame else missed
         missed = torch.where(missed & ~state["gate_passed"], beside.tanh(), 0.0)  # passed: when another was next
@@ -384,8 +368,10 @@ class RacingEnv(QuadrotorEnv):
             direction = ahead = (state["target"] - state["position"]) / gap.clamp_min(1e-6)
             if growth is not None and has_obstacles:
                 rotation = self.pose(world, world["gate"])[1]
-                around = self.around(world, quaternion.rotate(rotation, ahead), gap)
-                direction = quaternion.rotate_inverse(rotation, around)
+                clearance = min(CLEARANCE * self.drone_radius, self.gate_radius - self.drone_radius)
+                way = world["position"], quaternion.rotate(rotation, ahead), gap
+                turned = around(*way, clearance, functools.partial(self.obstacle, world))
+                direction = quaternion.rotate_inverse(rotation, turned)
             towards = (state["velocity"] * direction).sum(-1, keepdim=True)
             across = terms.norm(state["velocity"] - towards * direction)
             if growth is not None:  # along the way over that point, which moves
@@ -398,10 +384,10 @@ class RacingEnv(QuadrotorEnv):
         if self.weights["closing"]:
             place, velocity = world["position"] - self.centre, world["velocity"]
             room, speed = self.half_box - torch.where(velocity > 0.0, place, -place), velocity
-            if has_obstacles:
-                distance, away = self.obstacle(world, world["position"].unsqueeze(1))
-                closing = -(away.squeeze(1) * velocity).sum(-1, keepdim=True)
-                room, speed = torch.cat((room, distance[:, 0]), -1), torch.cat((speed, closing.clamp_min(0.0)), -1)
+            if self.scene is not None:
+                distance, away = self.scene.nearest(world)
+                closing = -(away * velocity).sum(-1, keepdim=True)
+                room, speed = torch.cat((room, distance), -1), torch.cat((speed, closing.clamp_min(0.0)), -1)
             needed = speed.square() / (2.0 * BRAKING * room.clamp_min(LEAST_ROOM))
             rewards["closing"] = -self.weights["closing"] * needed.clamp_min(1.0).log().sum(-1, keepdim=True)
         if self.gate_bonus != "binary":

@@ -170,15 +170,15 @@ def learn(
     """Train by iterations: the mean returns before and after, and the seconds.
 
     ``iterate`` takes the share of all steps that have been flown, and where the next horizon starts; flies and learns,
-    and gives the rollout and where it ended. The optimizers take their rates by the number of the iteration.
+    and gives the rollout and where it ended. The optimizers take their rates by that share.
     """
     before, start = mean_return(environment, actor), time.process_time()
-    carry, iteration, steps = place.starts(), 0, 0
+    carry, steps = place.starts(), 0
     while steps < STEPS:
         for optimizer in optimizers:
-            optimizer.anneal(iteration)
+            optimizer.anneal(steps / STEPS * optimizer.iterations)
         rollout, carry = iterate(steps / STEPS, carry)
-        iteration, steps = iteration + 1, steps + rollout.numel()
+        steps += rollout.numel()
         carry = place.go_on(carry)
     return before, mean_return(environment, actor), time.process_time() - start
 
@@ -282,7 +282,8 @@ def train_ppo(environment: str, seed: int) -> tuple[float, float, float]:
 
 
 def train_one_setting(environment: str, seed: int) -> tuple[float, float, float]:
-    """Train with the settings and the loop of recipes/train.py, and its near discount: nothing here is ever solved."""
+    """Train with the settings and the loop of recipes/train.py, but the near discount throughout, as nothing counts as
+    solved here, and with the fresh starts of the others."""
     cfg, place, actor, _ = set_up("train", environment, seed)
     loss = make_loss(objectives.AHACLoss, cfg, place.env, actor, make_value, horizon=cfg.horizon)
     loss.value_estimator.gamma.fill_(2.0 * cfg.gamma - 1.0)

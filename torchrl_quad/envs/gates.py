@@ -85,8 +85,8 @@ def around(
     ahead (n, 3), as far as the gap (n, 1) [m]; that direction itself where the way is clear.
 
     ``obstacle`` gives the distance (n, s, 1) [m] of points (n, s, 3) and the direction away, (n, s, 3). It is asked at
-    17 places, and at 17 around the closest of them. The way is turned aside by what it lacks of the clearance [m] there,
-    at most by 45 degrees, and without a gradient of its own.
+    17 places, and at 17 around the closest of them. The way is turned aside by what it lacks of the clearance [m]
+    there, at most by 45 degrees, and without a gradient of its own.
     """
     with torch.no_grad():
         share, best = torch.arange(LOOKS + 1, device=gap.device, dtype=gap.dtype) / LOOKS, 0.5 * gap

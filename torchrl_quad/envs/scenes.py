@@ -159,7 +159,8 @@ class Scene(Disturbance):
     def nearest(self, state: State) -> tuple[Tensor, Tensor]:
         """How far the drone's surface is from the nearest obstacle (n, 1) [m], and the direction (n, 3) away from it.
 
-        Negative where it touches. Both are differentiable, and finite everywhere, also within obstacles.
+        For positions (n, k, 3), too. Negative where it touches. Both are differentiable, and finite everywhere, also
+        within obstacles.
         """
         distance, away = nearest(self.solids(state), state["position"])
         return distance - self.radius, away

@@ -145,7 +145,7 @@ def _sphere_normal(x: Tensor, point: Tensor) -> tuple[Tensor, ...]:
 
 def _cylinder(x: Tensor, point: Tensor) -> Tensor:
     _, _, beside, above, _ = _cylinder_parts(x, point)
-    return from_faces(beside, above)
+    return _from_faces(beside, above)
 
 
 def _cylinder_normal(x: Tensor, point: Tensor) -> tuple[Tensor, ...]:
@@ -163,7 +163,7 @@ def _cylinder_parts(x: Tensor, point: Tensor) -> tuple[Tensor, ...]:
 
 
 def _box(x: Tensor, point: Tensor) -> Tensor:
-    return from_faces(*_box_parts(x, point)[1])
+    return _from_faces(*_box_parts(x, point)[1])
 
 
 def _box_normal(x: Tensor, point: Tensor) -> tuple[Tensor, ...]:
@@ -196,7 +196,7 @@ def _unit(*parts: Tensor) -> tuple[Tensor, ...]:
     return tuple(p / length for p in parts)
 
 
-def from_faces(*beyond: Tensor) -> Tensor:
+def _from_faces(*beyond: Tensor) -> Tensor:
     """The signed distance from a solid, from how far a point lies beyond each of its faces."""
     return _length(*(q.clamp_min(0.0) for q in beyond)) + functools.reduce(torch.maximum, beyond).clamp_max(0.0)
 

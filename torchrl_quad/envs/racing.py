@@ -66,8 +66,9 @@ class RacingEnv(QuadrotorEnv):
     passes an obstacle, a frame or the ground of the scene within two radii of the drone, v_t and v_a are about the
     direction that clears it. A step that crosses the plane of the gate elsewhere, or touches a frame, takes up to a
     bonus away, tanh(m) of it at m [m] from half of the opening. A drone pays 0.5 log(a / 15) for each side of the box
-    ahead, and for the nearest obstacle, that takes a > 15 m/s2 to stop before, a = v^2 / (2 d) with the speed v towards
-    it and the distance d, since a crash has no gradient; with spheres, too, by ``weights={"closing": 0.5}``.
+    ahead, and for the nearest obstacle or frame, that takes a > 15 m/s2 to stop before, a = v^2 / (2 d) with the speed v
+    towards it and the distance d, since a crash has no gradient; so gates with frames are flown through slowly. With
+    spheres, too, by ``weights={"closing": 0.5}``.
 
     A point is passed when the straight line of a control step comes within 0.3 m of it, a gate with a direction when
     that line crosses its plane, from behind, within its opening. The reward of that step is about the gate after it.
@@ -384,10 +385,10 @@ class RacingEnv(QuadrotorEnv):
         if self.weights["closing"]:
             place, velocity = world["position"] - self.centre, world["velocity"]
             room, speed = self.half_box - torch.where(velocity > 0.0, place, -place), velocity
-            if self.scene is not None:
-                distance, away = self.scene.nearest(world)
-                closing = -(away * velocity).sum(-1, keepdim=True)
-                room, speed = torch.cat((room, distance), -1), torch.cat((speed, closing.clamp_min(0.0)), -1)
+            if has_obstacles:
+                distance, away = self.obstacle(world, world["position"].unsqueeze(1))
+                closing = -(away.squeeze(1) * velocity).sum(-1, keepdim=True)
+                room, speed = torch.cat((room, distance[:, 0]), -1), torch.cat((speed, closing.clamp_min(0.0)), -1)
             needed = speed.square() / (2.0 * BRAKING * room.clamp_min(LEAST_ROOM))
             rewards["closing"] = -self.weights["closing"] * needed.clamp_min(1.0).log().sum(-1, keepdim=True)
         if self.gate_bonus != "binary":

@@ -12,6 +12,7 @@ degrees. Needs pip install l2f foundation-policy.
 import functools
 import itertools
 import json
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -367,6 +368,7 @@ ARENAS: dict[tuple[str, str], Callable[..., dict[str, float]]] = {
     ("any", ""): lambda pilot, n: in_ours(pilot, any_drone(n)),
     ("any, no delay", ""): lambda pilot, n: in_ours(pilot, any_drone(n, delay=0)),
     ("any, tilted by 1.2", ""): lambda pilot, n: in_ours(pilot, any_drone(n, tilt=1.2)),
+    ("any, any attitude", ""): lambda pilot, n: in_ours(pilot, any_drone(n, tilt=math.pi)),
     ("l2f", ""): in_l2f,
     **{("shipped", x): lambda pilot, n, x=x: in_ours(pilot, shipped(n, x, delay=1)) for x in SHIPPED},
     **{("shipped, no delay", x): lambda pilot, n, x=x: in_ours(pilot, shipped(n, x, delay=0)) for x in SHIPPED},
@@ -406,7 +408,7 @@ def main() -> None:
     def fly(policy: str, seed: int) -> None:
         missing = [x for x in ARENAS if x[0] in args.drones and (policy, str(seed), *x) not in done]
         if policy == "informed":  # of drones that tell all of themselves
-            missing = [x for x in missing if x[0] in ("any", "any, tilted by 1.2")]
+            missing = [x for x in missing if x[0] in ("any", "any, tilted by 1.2", "any, any attitude")]
         if not missing:
             return
         folder, seconds = Path(args.runs, f"{policy}_{seed}"), ""

@@ -66,8 +66,8 @@ class RacingEnv(QuadrotorEnv):
     passes an obstacle, a frame or the ground of the scene within two radii of the drone, v_t and v_a are about the
     direction that clears it. A step that crosses the plane of the gate elsewhere, or touches a frame, takes up to a
     bonus away, tanh(m) of it at m [m] from half of the opening. A drone pays 0.5 log(a / 15) for each side of the box
-    ahead, and for the nearest obstacle or frame, that takes a > 15 m/s2 to stop before, a = v^2 / (2 d) with the speed v
-    towards it and the distance d, since a crash has no gradient; so gates with frames are flown through slowly. With
+    ahead, and for the nearest obstacle or frame, that takes a > 15 m/s2 to stop before, a = v^2 / (2 d) with the speed
+    v towards it and the distance d, since a crash has no gradient; so gates with frames are flown through slowly. With
     spheres, too, by ``weights={"closing": 0.5}``.
 
     A point is passed when the straight line of a control step comes within 0.3 m of it, a gate with a direction when

@@ -47,18 +47,17 @@ def bar_distance(place: Tensor, opening: Tensor, thickness: float) -> tuple[Tens
 
 
 def nearest_frame(
-    points: Tensor, centres: Tensor, rotations: Tensor, openings: Tensor, thickness: float
+    position: Tensor, centres: Tensor, rotations: Tensor, openings: Tensor, thickness: float
 ) -> tuple[Tensor, Tensor]:
-    """The distance (n, s, 1) [m] of points (n, s, 3) from the bars of the nearest of k frames, and the direction away.
+    """The distance (n, 1) [m] of positions (n, 3) from the bars of the nearest of k frames, and the direction away.
 
     Centres are (n or 1, k, 3), rotations (n or 1, k, 4), and openings (k, 1 or 2).
     """
-    rotations = rotations.unsqueeze(1)
-    place = quaternion.rotate_inverse(rotations, points.unsqueeze(2) - centres.unsqueeze(1))
+    place = quaternion.rotate_inverse(rotations, position.unsqueeze(1) - centres)
     distance, away = bar_distance(place, openings, thickness)
-    distance, index = distance.min(2, keepdim=True)
-    away = quaternion.rotate(rotations, away).gather(2, index.expand(-1, -1, -1, 3))
-    return distance.squeeze(2), away.squeeze(2)
+    distance, index = distance.min(1, keepdim=True)
+    away = quaternion.rotate(rotations, away).gather(1, index.expand(-1, -1, 3))
+    return distance.squeeze(1), away.squeeze(1)
 
 
 def least_distance(

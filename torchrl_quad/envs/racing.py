@@ -1,6 +1,5 @@
 """The racing task."""
 
-import functools
 import math
 from typing import Annotated, Any, Literal
 
@@ -63,12 +62,11 @@ class RacingEnv(QuadrotorEnv):
     Where gates have a direction, d and v_a are about a point on the axis of the gate, before it by half of the drone's
     distance from the axis, and by the drone's way beyond the gate, which for a drone slower than 1 m/s begins up to
     half of the smallest opening before the gate; v_t is how fast the way over that point gets shorter. Where that way
-    passes an obstacle, a frame or the ground of the scene within two radii of the drone, v_t and v_a are about the
-    direction that clears it. A step that crosses the plane of the gate elsewhere, or touches a frame, takes up to a
-    bonus away, tanh(m) of it at m [m] from half of the opening. A drone pays 0.5 log(a / 15) for each side of the box
-    ahead, and for the nearest obstacle or frame, that takes a > 15 m/s2 to stop before, a = v^2 / (2 d) with the speed
-    v towards it and the distance d, since a crash has no gradient; so gates with frames are flown through slowly. With
-    spheres, too, by ``weights={"closing": 0.5}``.
+    passes an obstacle of the scene within two radii of the drone, v_t and v_a are about the direction that clears it. A
+    step that crosses the plane of the gate elsewhere, or touches a frame, takes up to a bonus away, tanh(m) of it at m
+    [m] from half of the opening. A drone pays 0.5 log(a / 15) for each side of the box ahead, and for the nearest
+    obstacle or frame, that takes a > 15 m/s2 to stop before, a = v^2 / (2 d) with the speed v towards it and the
+    distance d, since a crash has no gradient; with spheres, too, by ``weights={"closing": 0.5}``.
 
     A point is passed when the straight line of a control step comes within 0.3 m of it, a gate with a direction when
     that line crosses its plane, from behind, within its opening. The reward of that step is about the gate after it.
@@ -264,12 +262,11 @@ class RacingEnv(QuadrotorEnv):
         off = beyond_edges(torch.lerp(start, end, time)[:, 1:], self.openings[previous["gate"][:, 0]])
         return time, (start[:, :1] < 0.0) & (end[:, :1] >= 0.0) & (off < 0.0).all(-1, keepdim=True)
 
-    def obstacle(self, state: State, points: Tensor) -> tuple[Tensor, Tensor]:
-        """How far the drone's surface, at points (n, s, 3), is from the nearest obstacle or frame, (n, s, 1) [m], and
-        the direction away from that, (n, s, 3)."""
-        found = [] if self.scene is None else [self.scene.nearest({**state, "position": points})]
+    def obstacle(self, state: State) -> tuple[Tensor, Tensor]:
+        """How far the drone's surface is from the nearest obstacle or frame, (n, 1) [m], and the way out (n, 3)."""
+        found = [] if self.scene is None else [self.scene.nearest(state)]
         if self.frame:
-            distance, away = nearest_frame(points, *self.poses(state), self.openings, self.frame)
+            distance, away = nearest_frame(state["position"], *self.poses(state), self.openings, self.frame)
             found.append((distance - self.drone_radius, away))
         if len(found) == 1:
             return found[0]
@@ -362,16 +359,16 @@ class RacingEnv(QuadrotorEnv):
         if self.is_directed:
             state, growth, missed = self.lead(state)
             bonus = bonus - missed
-        gap, has_obstacles = terms.distance(state), self.scene is not None or self.frame > 0.0
+        gap, scene = terms.distance(state), self.scene
         if self.reward == "position":
             rewards = terms.target_reward(state, self.weights)
         else:
             direction = ahead = (state["target"] - state["position"]) / gap.clamp_min(1e-6)
-            if growth is not None and has_obstacles:
+            if growth is not None and scene is not None:
                 rotation = self.pose(world, world["gate"])[1]
                 clearance = min(CLEARANCE * self.drone_radius, self.gate_radius - self.drone_radius)
                 way = world["position"], quaternion.rotate(rotation, ahead), gap
-                turned = around(*way, clearance, functools.partial(self.obstacle, world))
+                turned = around(*way, clearance, lambda points: scene.nearest({**world, "position": points}))
                 direction = quaternion.rotate_inverse(rotation, turned)
             towards = (state["velocity"] * direction).sum(-1, keepdim=True)
             across = terms.norm(state["velocity"] - towards * direction)
@@ -385,10 +382,10 @@ class RacingEnv(QuadrotorEnv):
         if self.weights["closing"]:
             place, velocity = world["position"] - self.centre, world["velocity"]
             room, speed = self.half_box - torch.where(velocity > 0.0, place, -place), velocity
-            if has_obstacles:
-                distance, away = self.obstacle(world, world["position"].unsqueeze(1))
-                closing = -(away.squeeze(1) * velocity).sum(-1, keepdim=True)
-                room, speed = torch.cat((room, distance[:, 0]), -1), torch.cat((speed, closing.clamp_min(0.0)), -1)
+            if scene is not None or self.frame:
+                distance, away = self.obstacle(world)
+                closing = -(away * velocity).sum(-1, keepdim=True)
+                room, speed = torch.cat((room, distance), -1), torch.cat((speed, closing.clamp_min(0.0)), -1)
             needed = speed.square() / (2.0 * BRAKING * room.clamp_min(LEAST_ROOM))
             rewards["closing"] = -self.weights["closing"] * needed.clamp_min(1.0).log().sum(-1, keepdim=True)
         if self.gate_bonus != "binary":

@@ -34,7 +34,7 @@ FUNNEL = 0.5  # how far before a gate the reward leads, as a share of the way to
 ROUND = 0.1  # [m], from the axis, where the way to it is rounded off
 SLOW = 1.0  # [m/s], towards a gate: slower drones are led back before its plane, since they would hang at it
 BRAKING, LEAST_ROOM = 15.0, 0.05  # [m/s2], what costs nothing; [m], below which nothing gets nearer
-CLEARANCE = 2.0  # how far from them the reward leads, in radii of the drone; as far as an opening allows
+CLEARANCE = 2.0  # how far past obstacles the reward leads, in radii of the drone; at most as far as a gate allows
 
 
 class RacingEnv(QuadrotorEnv):

@@ -1,5 +1,6 @@
 """The building blocks of a recipe, and horizons with their graph in TorchRL's Trainer and collectors."""
 
+import math
 from types import SimpleNamespace
 
 import pytest
@@ -26,7 +27,7 @@ from torchrl_quad.training.building import (
     minibatches,
     shuffled,
 )
-from torchrl_quad.training.evaluation import has_levelled_off, last_rise, looks_ahead
+from torchrl_quad.training.evaluation import has_levelled_off, has_lost_its_way, last_rise, looks_ahead
 from torchrl_quad.training.loop import Run, backward
 
 
@@ -83,9 +84,9 @@ def test_a_schedule_goes_from_the_first_to_the_last_learning_rate(schedule, half
 
 
 def test_the_inverse_square_root_of_the_iteration_is_the_same_rate_in_runs_of_every_length():
-    for length in (301, 5000):
+    for length in (901, 5000):
         adam = optimizer(length, schedule="inverse_sqrt")
-        for iteration, rate in ((0, 1e-2), (50, 1e-2), (200, 5e-3), (300, 1e-2 / 6**0.5)):
+        for iteration, rate in ((0, 1e-2), (150, 1e-2), (600, 5e-3), (900, 1e-2 / 6**0.5)):
             adam.anneal(iteration)
             assert adam.param_groups[0]["lr"] == pytest.approx(rate)
 
@@ -127,6 +128,20 @@ def test_a_run_levels_off_when_no_evaluation_has_risen_for_a_share_of_it():
     assert not looks_ahead(low + later, None)
     curve[7]["eval/solved"] = 0.52
     assert last_rise(curve) == 80 and last_rise([*curve, curve[-1] | {"eval/return": float("nan")}]) == 80
+
+
+@cases(
+    (True, [0.2, 0.9, 0.5], [0, 100, 89]),
+    (False, [0.2, 0.9, 0.5], [0, 100, 91]),  # it just misses the last gate
+    (False, [0.2, 0.9, 0.7], [0, 100, 50]),
+    (False, [0.2, 0.4, 0.0], [0, 100, 50]),  # it never had a way
+    (True, [0.2, 0.9, 0.0], [0, 100, math.nan]),
+    (True, [0.2, 0.9, 0.0], [0, 100, -math.inf]),
+    (False, [0.2, 0.9], [math.nan, 100]),
+)
+def test_a_run_has_lost_its_way_where_it_solves_a_third_less_and_its_return_fell(lost, solved, returns):
+    rows = [{"eval/solved": x, "eval/return": y} for x, y in zip(solved, returns, strict=True)]
+    assert has_lost_its_way(rows) == lost
 
 
 def test_when_a_run_evaluates_follows_from_what_every_process_knows():

@@ -162,7 +162,7 @@ def parameter_groups(name: str, module: nn.Module) -> list[dict[str, Any]]:
 class Optimizer(torch.optim.Adam):
     """Adam, a schedule that takes its learning rate from ``lr`` to ``final_lr`` over the run, and a bound on gradients.
 
-    The schedule ``inverse_sqrt`` is for runs of any length: it falls with one over the root of the iteration, after 50.
+    The schedule ``inverse_sqrt`` is for runs of any length: from iteration 150 on it falls with one over its root.
     ``name`` is the section of the network, "actor" or "critic"; ``module`` is that network, or the loss that holds it.
     """
 
@@ -176,7 +176,7 @@ class Optimizer(torch.optim.Adam):
             "linear": lambda share: 1.0 + share * (decay - 1.0),
             "exponential": lambda share: decay**share,
             "cosine": lambda share: decay + (1.0 - decay) * 0.5 * (1.0 + math.cos(math.pi * share)),
-            "inverse_sqrt": lambda share: max(share * (self.iterations - 1) / 50, 1.0) ** -0.5,
+            "inverse_sqrt": lambda share: max(share * (self.iterations - 1) / 150, 1.0) ** -0.5,
         }
         self.factor = factors[section.schedule]
 

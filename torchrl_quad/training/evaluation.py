@@ -85,6 +85,16 @@ def has_levelled_off(
     return last_rise(rows) <= (1.0 - patience) * rows[-1]["steps"]
 
 
+def has_lost_its_way(rows: Sequence[Mapping[str, float]]) -> bool:
+    """Whether a run that once solved half of an evaluation's episodes solves less than two thirds of its best.
+
+    Its return has also fallen by a tenth of the range: a race that just misses the last gate is not lost.
+    """
+    solved, returns = ([row[f"eval/{name}"] for row in rows] for name in ("solved", "return"))
+    known = [x for x in returns if math.isfinite(x)] or [0.0]
+    return 0.5 <= max(solved) > 1.5 * solved[-1] and not returns[-1] >= max(known) - 0.1 * (max(known) - min(known))
+
+
 def looks_ahead(rows: Sequence[Mapping[str, float]], patience: float | None) -> bool:
     """Whether a run has solved half of an evaluation's episodes, or has once levelled off without.
 

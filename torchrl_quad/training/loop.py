@@ -55,6 +55,7 @@ from torchrl_quad.training.evaluation import (
     evaluate,
     final_evaluation,
     has_levelled_off,
+    has_lost_its_way,
     last_rise,
     looks_ahead,
     print_summary,
@@ -74,8 +75,8 @@ class Run:
     Every ``eval.interval`` iterations the run writes a row of metrics and a checkpoint, which holds all that it needs
     to continue bit for bit, and the best policy so far: the one that solved most episodes in an evaluation, and of
     those the one with the greatest return. At the end that policy flies from other starts. With ``eval.patience``, a
-    run that solves less than two thirds of what this policy solved goes back to it, with its critics and optimisers;
-    each further time at half the actor's rate, down to a sixteenth.
+    run that has lost its way goes back to it, with its critics and optimisers; from the second time on at half the
+    actor's rate, from the third at a quarter.
 
     The seconds are those of the loop, without set-up, compilation, evaluations and checkpoints.
 
@@ -184,7 +185,7 @@ class Run:
                         bar.set_postfix_str(f"return {metrics['eval/return']:.2f}, solved {solved:.0%}")
                         self.looks_ahead = looks_ahead(self.rows, self.cfg.eval.patience)
                         self.levelled_off = has_levelled_off(self.rows, self.cfg.eval.patience)
-                        if 0.5 <= self.best["solved"] > 1.5 * solved:
+                        if has_lost_its_way(self.rows):
                             best = self.best.get("stateful")
                     self.looks_ahead, self.levelled_off, best = of_first((self.looks_ahead, self.levelled_off, best))
                     if best is not None:
@@ -301,7 +302,7 @@ class Run:
             x.load_state_dict(copy.deepcopy(state))
             if isinstance(x, Optimizer) and x.name == "actor":
                 for group in state["param_groups"]:  # for the next time
-                    group["share"] = max(group.get("share", 1.0) / 2, 1 / 16)
+                    group["share"] = max(group.get("share", 1.0) / 2, 1 / 4)
         # The weights of which the best policy was the mean may be poor.
         self.actor.load_state_dict(self.flown.state_dict())
         self.carry = self.env.reset()

@@ -65,7 +65,7 @@ class Changed(MuJoCo):
             height = self.x[:, STATE["position"]][:, 2:]
             return still(quaternion, velocity - wind * np.clip(0.7 + 0.2 * height, 0.0, 2.0))
 
-        recorded.keep = loop.keep
+        recorded.keep, recorded.drone = loop.keep, drone
         self.control.loop, drone.drag = recorded, blown
 
     def log(self, seed: int) -> FlightLog:

@@ -24,6 +24,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from benchmarks.adaptation import Changed
 from benchmarks.paper.running import kept, run, side_by_side
 from benchmarks.report import RESULTS, command_line, publish
 from torchrl_quad import HoveringEnv, available_drones, load_drone
@@ -281,8 +282,8 @@ def shipped(n: int, name: str, delay: int) -> HoveringEnv:
     return HoveringEnv(n, seed=STARTS, drone=drone, random_start=start, **options)
 
 
-def in_mujoco(pilot: Any, n: int, name: str) -> dict[str, float]:
-    """On a drone that ships, in MuJoCo, as a contract describes it, with a delay of one step."""
+def in_mujoco(pilot: Any, n: int, name: str, changed: int | None = None) -> dict[str, float]:
+    """On a drone that ships, in MuJoCo, as a contract describes it, or changed, as a seed draws it; one step late."""
     env = shipped(n, name, delay=1)
     full, state = 2.0 * env.dynamics.controller.scale, env.reset()["state"]  # [N], of each rotor
     fields = {k: x.tolist() for k, x in env.nominal.to(dtype=torch.float64).fields().items()}
@@ -290,7 +291,9 @@ def in_mujoco(pilot: Any, n: int, name: str) -> dict[str, float]:
     limits = {"body_rate": {"range": [[-1.0, 1.0]] * 3}, "thrust": {"range": [0.0, 1.0]}}  # of the other modes
     output = {"control": "rotor_thrusts", "gains": {}, **limits}
     rest = {"control_dt": DT, "plant": {}, "camera": None, "obstacles": None}
-    simulator = simulator_class("mujoco")({"drone": fields, "output": output, **rest}, "contract", range(4))
+    contract = {"drone": fields, "output": output, **rest}
+    plain = simulator_class("mujoco")(contract, "contract", range(4))
+    simulator = plain if changed is None else Changed(contract, changed)
     names = ("position", "quaternion", "velocity", "angular_velocity")
     simulator.reset({k: state[k].double().numpy() for k in names})
     waiting = Rotors(env.nominal).thrust(env.dynamics.controller.hover_speed).expand(n, 4)
@@ -373,6 +376,7 @@ ARENAS: dict[tuple[str, str], Callable[..., dict[str, float]]] = {
     **{("shipped", x): lambda pilot, n, x=x: in_ours(pilot, shipped(n, x, delay=1)) for x in SHIPPED},
     **{("shipped, no delay", x): lambda pilot, n, x=x: in_ours(pilot, shipped(n, x, delay=0)) for x in SHIPPED},
     **{("mujoco", x): functools.partial(in_mujoco, name=x) for x in SHIPPED},
+    **{("changed", str(x)): functools.partial(in_mujoco, name="visfly", changed=x) for x in range(10)},
 }
 POLICIES = {"large": [], "small": ["actor.num_cells=[24]", "actor.hidden_size=24"], "raptor": [], "informed": []}
 PILOTS = {"raptor": Raptor, "informed": Informed}  # that are not trained here

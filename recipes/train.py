@@ -29,14 +29,17 @@ def main(cfg: DictConfig) -> None:
         # Until half of the episodes are solved, or returns level off, the discount looks half as far ahead.
         loss.value_estimator.gamma.fill_(cfg.gamma if run.looks_ahead else 2.0 * cfg.gamma - 1.0)
         run.horizon = loss.horizon
-        # The actor: up the return of one horizon and the value of its end, through the dynamics.
+        # The actor: towards actions that raise the return of one horizon and the value of its end.
         rollout, end = differentiable_rollout(env, actor, run.carry, run.horizon)
         scale.divide(rollout)
-        loss_actor, metrics = loss.loss_actor(rollout)
-        run.optimise(actor_optimizer, loss_actor + metrics.get("loss_alpha", 0.0))
+        target, metrics = loss.better_actions(rollout, cfg.step)
+        data = rollout.detach().set("action_target", target)
+        for _ in range(cfg.epochs):
+            loss_actor = loss.loss_fit(data)
+            run.optimise(actor_optimizer, loss_actor)
 
         # The critics: towards TD(lambda) targets, from the least of them.
-        data = loss.write_value_target(rollout.detach())
+        data = loss.write_value_target(data)
         scale.update(data)
         critic_metrics = run.fit_critic(critic_optimizer, data)
 

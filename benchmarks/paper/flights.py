@@ -27,7 +27,7 @@ from torchrl_quad.training.configuration import CONFIG
 from torchrl_quad.training.evaluation import drawing_from, evaluate, load_policy
 
 METHODS = {name: name.upper() for name in ("bptt", "shac", "abpt", "sapo", "ahac")}
-METHODS |= {"hybrid": "Hybrid", "ppo": "PPO", "train": "One setting"}  # the last, train.py, has no tuned files
+METHODS |= {"pods": "PODS", "hybrid": "Hybrid", "ppo": "PPO", "train": "One setting"}  # train.py has no tuned files
 TASKS = {  # what is shown of each with the solved episodes: column, factor, digits, unit
     "hovering": ("position_error", 100, 1, "cm"),
     "tracking": ("tracking_rmse", 100, 1, "cm"),

@@ -118,6 +118,14 @@ def segments(done: Tensor) -> tuple[Tensor, Tensor]:
     return end.roll(1, -2), end
 
 
+def mean_over_steps(x: Tensor, counts: Tensor | None) -> Tensor:
+    """The mean of x (*, horizon) over the steps that count, bool (*, horizon, 1), all of them for None: (*)."""
+    if counts is None:
+        return x.mean(-1)
+    counts = counts.squeeze(-1)
+    return torch.where(counts, x, 0.0).sum(-1) / counts.sum(-1).clamp(min=1)
+
+
 def step_in_segment(done: Tensor) -> Tensor:
     """The steps of each segment, counted from 0."""
     start, _ = segments(done)

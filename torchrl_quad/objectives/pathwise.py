@@ -17,7 +17,16 @@ from torchrl.objectives.utils import ValueEstimators, default_value_kwargs, disp
 
 from torchrl_quad.data.unwrap import check_tensordict, leaf
 from torchrl_quad.errors import Unsupported, UserTypeError, UserValueError, WrongState, shown
-from torchrl_quad.objectives.calls import MedianClip, act_again, action_gradient, discounts, takes_rollout, total
+from torchrl_quad.objectives.calls import (
+    MedianClip,
+    act_again,
+    action_gradient,
+    discounts,
+    mean_over_steps,
+    median_length,
+    takes_rollout,
+    total,
+)
 from torchrl_quad.objectives.gaussian import sampler_of
 from torchrl_quad.options import Coefficient, Entry, Fraction, Positive, Scale, between, check_value, checked
 
@@ -55,6 +64,7 @@ class PathwiseLoss(LossModule):
         """The tensordict keys that ``set_keys`` can change; reward, done and terminated are read under "next"."""
 
         action: NestedKey = "action"
+        action_target: NestedKey = "action_target"
         reward: NestedKey = "reward"
         done: NestedKey = "done"
         terminated: NestedKey = "terminated"
@@ -276,6 +286,27 @@ class PathwiseLoss(LossModule):
                 gap = entropy.detach() - self._target_entropy(tensordict)
                 metadata["loss_alpha"] = self._reduce_loss(self.log_alpha * gap)
         return self._reduce_loss(-objective), metadata
+
+    def better_actions(self, tensordict: TensorDictBase, step: float = 0.1) -> tuple[Tensor, dict[str, Tensor]]:
+        """Actions (*, horizon, k) that raise J, to fit the policy to by :meth:`loss_fit`, and the metadata.
+
+        Each action of the rollout, which carries its graph, moves along the gradient of J in it; the median of these
+        changes has the length ``step``, in units of the action.
+        """
+        objective, metadata = self._objective(tensordict)
+        action = leaf(tensordict, self.tensor_keys.action)
+        grad, measured = self._measure(action_gradient(objective.sum(), action))
+        change = grad * (step / median_length(grad.norm(dim=-1)))
+        return action.detach() + change.nan_to_num(0.0, 0.0, 0.0), metadata | measured
+
+    def loss_fit(self, tensordict: TensorDictBase) -> Tensor:
+        """Half the squared distance of the policy's actions from ``action_target`` in a rollout (*, horizon), whose
+        other entries may be detached, and which several steps of an optimiser may share; a mean over those that count.
+        """
+        target, counts = leaf(tensordict, self.tensor_keys.action_target), self._counts(tensordict)
+        action = act_again(self.actor_network, self.actor_network_params, tensordict)[self.tensor_keys.action]
+        distance = 0.5 * (action - target).square().sum(-1)
+        return self._reduce_loss(mean_over_steps(distance, counts))
 
     def objective_parts(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         """The terms whose sum is J, without the entropy bonus, each (*,) with its graph: the discounted ``rewards``."""

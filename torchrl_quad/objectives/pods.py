@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
-from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_quad.data.unwrap import leaf
 from torchrl_quad.errors import Unsupported
-from torchrl_quad.objectives.calls import act_again, action_gradient, median_length, sources_of_steps, with_fixed
+from torchrl_quad.objectives.calls import action_gradient, mean_over_steps, median_length, sources_of_steps, with_fixed
 from torchrl_quad.objectives.pathwise import PathwiseLoss
 from torchrl_quad.options import Positive, between
 
@@ -60,12 +58,6 @@ class PODSLoss(PathwiseLoss):
         NotImplementedError: (in use) order 2 of a flight that was compiled.
     """
 
-    @dataclass
-    class _AcceptedKeys(PathwiseLoss._AcceptedKeys):
-        action_target: NestedKey = "action_target"
-
-    default_keys = _AcceptedKeys
-
     def __init__(
         self,
         actor_network: TensorDictModule,
@@ -82,44 +74,36 @@ class PODSLoss(PathwiseLoss):
 
     def write_action_target(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add ``action_target``, the actions to learn, to a rollout (*, horizon) that carries its graph."""
+        if self.order == 1:
+            target, _ = self.better_actions(tensordict, self.step)
+            return tensordict.set(self.tensor_keys.action_target, target)
         objective, _ = self._objective(tensordict)
         action = leaf(tensordict, self.tensor_keys.action)
-        second = self.order == 2
-        if second and isinstance(sources_of_steps(action), Tensor):
+        if isinstance(sources_of_steps(action), Tensor):
             raise Unsupported(
                 "PODSLoss(order=2) differentiates twice, and a compiled flight only once: call env.eager() before "
                 "flying (in a recipe: compile=false), or take order=1."
             )
-        whole = action_gradient(objective.sum(), action, create_graph=second)
+        whole = action_gradient(objective.sum(), action, create_graph=True)
         grad, _ = self._measure(whole.detach())
         damping = median_length(grad.norm(dim=-1)) / self.step
-        change = grad / damping
-        if second:
 
-            def damped(x: Tensor) -> Tensor:
-                """lambda - the second derivative, times a change."""
-                return damping * x - action_gradient((whole * x).sum(), action)
+        def damped(x: Tensor) -> Tensor:
+            """lambda - the second derivative, times a change."""
+            return damping * x - action_gradient((whole * x).sum(), action)
 
-            change = conjugate_gradients(damped, grad, change, self.iterations)
+        change = conjugate_gradients(damped, grad, grad / damping, self.iterations)
         return tensordict.set(self.tensor_keys.action_target, action.detach() + change.nan_to_num(0.0, 0.0, 0.0))
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Half the squared distance of the policy's actions from the targets in a rollout, which are added if missing,
-        and its metadata; steps that do not count are left out."""
+        """:meth:`loss_fit` and its metadata; targets that are missing are added."""
         if self.tensor_keys.action_target not in tensordict:
             tensordict = self.write_action_target(tensordict.copy())
-        target = leaf(tensordict, self.tensor_keys.action_target)
-        action = act_again(self.actor_network, self.actor_network_params, tensordict)[self.tensor_keys.action]
         rewards = self._discounts(tensordict) * self._next(tensordict, "reward")
-        change = (target - leaf(tensordict, self.tensor_keys.action)).norm(dim=-1).detach()
-        distance, counts = 0.5 * (action - target).square().sum(-1), self._counts(tensordict)
-        if counts is None:
-            mean, change = distance.mean(-1), change.mean()
-        else:
-            counts = counts.squeeze(-1)
-            mean = torch.where(counts, distance, 0.0).sum(-1) / counts.sum(-1).clamp(min=1)
-            change = torch.where(counts, change, 0.0).sum() / counts.sum().clamp(min=1)
-        return self._reduce_loss(mean), {"n_step_return": rewards.sum((-2, -1)).detach().mean(), "change": change}
+        target, action = (leaf(tensordict, x) for x in (self.tensor_keys.action_target, self.tensor_keys.action))
+        change = mean_over_steps((target - action).norm(dim=-1).detach(), self._counts(tensordict)).mean()
+        metadata = {"n_step_return": rewards.sum((-2, -1)).detach().mean(), "change": change}
+        return self.loss_fit(tensordict), metadata
 
 
 def conjugate_gradients(

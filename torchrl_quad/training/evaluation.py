@@ -73,7 +73,7 @@ def last_rise(rows: Sequence[Mapping[str, float]]) -> int:
 
 
 def has_levelled_off(
-    rows: Sequence[Mapping[str, float]], patience: float | None, solved: float = 0.5, least: int = 10
+    rows: Sequence[Mapping[str, float]], patience: float | None, solved: float = 0.5, least: int = 30
 ) -> bool:
     """Whether no evaluation of a run has risen for a share ``patience`` of it; never where that is None.
 
@@ -93,6 +93,18 @@ def has_lost_its_way(rows: Sequence[Mapping[str, float]]) -> bool:
     solved, returns = ([row[f"eval/{name}"] for row in rows] for name in ("solved", "return"))
     known = [x for x in returns if math.isfinite(x)] or [0.0]
     return 0.5 <= max(solved) > 1.5 * solved[-1] and not returns[-1] >= max(known) - 0.1 * (max(known) - min(known))
+
+
+def stalls(rows: Sequence[Mapping[str, float]], since: int, patience: float | None, least: int = 10) -> bool:
+    """Whether a run that once solved half of an evaluation's episodes needs a lower rate.
+
+    That is where no evaluation has risen for two thirds of its patience, and for ``least`` of them, nor since a step.
+    """
+    if patience is None or max(row["eval/solved"] for row in rows) < 0.5:
+        return False
+    since = max(since, last_rise(rows))
+    waited = sum(row["steps"] > since for row in rows) >= least
+    return waited and since <= (1.0 - patience * 2 / 3) * rows[-1]["steps"]
 
 
 def looks_ahead(rows: Sequence[Mapping[str, float]], patience: float | None) -> bool:

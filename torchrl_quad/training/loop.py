@@ -60,12 +60,22 @@ from torchrl_quad.training.evaluation import (
     looks_ahead,
     print_summary,
     rounds,
+    stalls,
     title,
     write_summary,
 )
 from torchrl_quad.training.logs import Logs
 
-PROGRESS = ("iteration", "steps", "skipped", "seconds", "processor_seconds", "rows", "best")  # of a checkpoint
+PROGRESS = (  # of a checkpoint
+    "iteration",
+    "steps",
+    "skipped",
+    "seconds",
+    "processor_seconds",
+    "rows",
+    "best",
+    "slower_since",
+)
 CELL = 0.5  # [m]: train/start_cells counts the cubes of this size in which horizons have started
 
 
@@ -75,8 +85,8 @@ class Run:
     Every ``eval.interval`` iterations the run writes a row of metrics and a checkpoint, which holds all that it needs
     to continue bit for bit, and the best policy so far: the one that solved most episodes in an evaluation, and of
     those the one with the greatest return. At the end that policy flies from other starts. With ``eval.patience``, a
-    run that has lost its way goes back to it, with its critics and optimisers; from the second time on at half the
-    actor's rate, from the third at a quarter.
+    run that has lost its way goes back to it, with its critics and optimisers; so does a run that has stalled, at a
+    quarter of the actor's rate.
 
     The seconds are those of the loop, without set-up, compilation, evaluations and checkpoints.
 
@@ -115,7 +125,7 @@ class Run:
         self.recorded: dict[str, list[float]] = defaultdict(list)
         self.starts: list[Tensor] = []  # positions in which the horizons since the last row have started
         self.rows: list[dict[str, float]] = []  # of metrics.csv
-        self.iteration, self.seconds, self.processor_seconds, self.skipped = 0, 0.0, 0.0, 0
+        self.iteration, self.seconds, self.processor_seconds, self.skipped, self.slower_since = 0, 0.0, 0.0, 0, 0
         self.best: dict[str, Any] = {"solved": -math.inf, "return": -math.inf}
         self.folder = Path(HydraConfig.get().runtime.output_dir)
         self.saved: Path | None = None  # the last checkpoint known to be intact
@@ -178,18 +188,20 @@ class Run:
                 self.steps += self.horizon * self.drones
                 bar.update(self.horizon * self.drones)
                 if self.is_due or self.steps >= self.total_steps:
-                    best, self.evaluated = None, self.iteration
+                    best, slower, self.evaluated = None, False, self.iteration
                     if rank() == 0:
                         metrics = self._evaluate()
                         solved = metrics["eval/solved"]
                         bar.set_postfix_str(f"return {metrics['eval/return']:.2f}, solved {solved:.0%}")
                         self.looks_ahead = looks_ahead(self.rows, self.cfg.eval.patience)
                         self.levelled_off = has_levelled_off(self.rows, self.cfg.eval.patience)
-                        if has_lost_its_way(self.rows):
+                        slower = stalls(self.rows, self.slower_since, self.cfg.eval.patience)
+                        if slower or has_lost_its_way(self.rows):
                             best = self.best.get("stateful")
-                    self.looks_ahead, self.levelled_off, best = of_first((self.looks_ahead, self.levelled_off, best))
+                    known = self.looks_ahead, self.levelled_off, best, slower
+                    self.looks_ahead, self.levelled_off, best, slower = of_first(known)
                     if best is not None:
-                        self._roll_back(best)
+                        self._roll_back(best, slower)
                     self.recorded.clear()
                     self.starts.clear()
                     self._save(self.folder / "checkpoint.pt")
@@ -296,13 +308,15 @@ class Run:
                 self.best["stateful"] = copy.deepcopy([x.state_dict() for x in self.stateful])
         return metrics
 
-    def _roll_back(self, stateful: list[dict[str, Any]]) -> None:
-        """Go back to the best policy with its critics and optimisers, from fresh starts."""
+    def _roll_back(self, stateful: list[dict[str, Any]], slower: bool) -> None:
+        """Go back to the best policy with its critics and optimisers, from fresh starts, perhaps at a quarter of its
+        rate."""
         for x, state in zip(self.stateful, stateful, strict=True):
+            if slower and isinstance(x, Optimizer) and x.name == "actor":
+                self.slower_since = self.steps
+                for group in state["param_groups"]:
+                    group["share"] = group.get("share", 1.0) / 4
             x.load_state_dict(copy.deepcopy(state))
-            if isinstance(x, Optimizer) and x.name == "actor":
-                for group in state["param_groups"]:  # for the next time
-                    group["share"] = max(group.get("share", 1.0) / 2, 1 / 4)
         # The weights of which the best policy was the mean may be poor.
         self.actor.load_state_dict(self.flown.state_dict())
         self.carry = self.env.reset()
@@ -385,7 +399,7 @@ class Run:
             if own["cuda"] is not None:
                 torch.cuda.set_rng_state(own["cuda"], self.env.device)
             for name in PROGRESS:
-                setattr(self, name, saved[name])
+                setattr(self, name, saved.get(name, getattr(self, name)))  # older ones lack the last
             self.best |= {name: float(self.best[name]) for name in ("solved", "return")}
             self.rows = [{str(name): value + 0 for name, value in row.items()} for row in self.rows]
         self.saved, before = path, saved["revision"]

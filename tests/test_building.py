@@ -27,7 +27,7 @@ from torchrl_quad.training.building import (
     minibatches,
     shuffled,
 )
-from torchrl_quad.training.evaluation import has_levelled_off, has_lost_its_way, last_rise, looks_ahead
+from torchrl_quad.training.evaluation import has_levelled_off, has_lost_its_way, last_rise, looks_ahead, stalls
 from torchrl_quad.training.loop import Run, backward
 
 
@@ -118,9 +118,10 @@ def test_a_run_levels_off_when_no_evaluation_has_risen_for_a_share_of_it():
     returns = [-10.0, 90.0, 90.9, 91.1, 91.9, *[92.0] * 5]  # a rise is 1 % of the range, 1: at the fourth step
     curve = [{"steps": 10 * i, "eval/return": x, "eval/solved": 0.5} for i, x in enumerate(returns, 1)]
     assert [last_rise(curve[:n]) for n in range(1, 11)] == [10, 20, 20, 40, 40, 40, 40, 40, 40, 40]
-    assert [has_levelled_off(curve, x) for x in (None, 0.61, 0.59, 0.5)] == [False, False, True, True]
-    assert not has_levelled_off(curve[:9], 0.5)  # too few evaluations to say
-    assert not has_levelled_off([row | {"eval/solved": 0.4} for row in curve], 0.5)  # the task is not solved
+    level = [has_levelled_off(curve, x, least=10) for x in (None, 0.61, 0.59, 0.5)]
+    assert level == [False, False, True, True]
+    assert not has_levelled_off(curve, 0.5)  # too few evaluations to say
+    assert not has_levelled_off([row | {"eval/solved": 0.4} for row in curve], 0.5, least=10)  # the task is not solved
     low = [row | {"eval/solved": 0.4} for row in curve]
     later = [row | {"steps": 110.0} for row in low[-1:]] * 20
     assert [looks_ahead(rows, 1.0) for rows in ([], curve[:1], low, low + later)] == [False, True, False, True]
@@ -142,6 +143,15 @@ def test_a_run_levels_off_when_no_evaluation_has_risen_for_a_share_of_it():
 def test_a_run_has_lost_its_way_where_it_solves_a_third_less_and_its_return_fell(lost, solved, returns):
     rows = [{"eval/solved": x, "eval/return": y} for x, y in zip(solved, returns, strict=True)]
     assert has_lost_its_way(rows) == lost
+
+
+def test_a_run_stalls_when_no_evaluation_has_risen_for_half_of_its_patience_and_once_each_time():
+    curve = [{"steps": 10 * i, "eval/return": min(i, 20.0), "eval/solved": 0.5} for i in range(1, 62)]
+    assert next(n for n in range(1, 62) if stalls(curve[:n], 0, 0.8)) == 34
+    assert next(n for n in range(1, 62) if stalls(curve[:n], 300, 0.8)) == 50
+    assert not stalls(curve, 0, None) and not stalls([row | {"eval/solved": 0.4} for row in curve], 0, 0.5)
+    rare = [row | {"steps": 100 * row["steps"], "eval/return": 1.0} for row in curve[1:]]
+    assert next(n for n in range(1, 60) if stalls(curve[:1] + rare[:n], 0, 0.5)) == 10  # evaluations at least
 
 
 def test_when_a_run_evaluates_follows_from_what_every_process_knows():

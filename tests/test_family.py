@@ -145,22 +145,22 @@ def test_the_second_order_of_pods_is_that_of_the_dynamics():
     assert (expected - gradient / damping).abs().max() > 0.01 * expected.abs().max()  # the second order tells
 
 
-def test_one_step_of_pods_goes_where_backpropagation_through_time_goes(env64):
+def test_one_step_towards_better_actions_goes_where_the_loss_itself_goes(env64):
     actor = make_actor(env64)
     rollout, _ = differentiable_rollout(env64, actor, None, 5)
     pods, bptt = PODSLoss(actor, step=0.3, clip_action_gradient=2.0), BPTTLoss(actor, clip_action_gradient=2.0)
-    flight = pods.write_action_target(rollout.copy()).detach()
-    grads = [
-        torch.cat(
-            [
-                x.flatten()
-                for x in torch.autograd.grad(loss, list(actor.parameters()), allow_unused=True)
-                if x is not None
-            ]
-        )
-        for loss in (pods.loss_actor(flight)[0], bptt.loss_actor(rollout)[0])
-    ]
-    torch.testing.assert_close(grads[0] / grads[0].norm(), grads[1] / grads[1].norm())
+    ahac = AHACLoss(actor, make_value(env64), horizon=5, clip_action_gradient=2.0)
+    target, measured = ahac.better_actions(rollout, 0.3)
+    assert {"stiffness", "clipped", "n_step_return"} <= measured.keys()
+    length = (target - rollout["action"]).norm(dim=-1)
+    assert length[length > 0].median().item() == pytest.approx(0.3)  # those that do not act within the horizon apart
+    by_pods = pods.write_action_target(rollout.copy()).detach()
+    assert not torch.allclose(target, by_pods["action_target"])  # which has no value of the end
+    towards = ahac.loss_fit(rollout.detach().set("action_target", target))
+    for pair in ((pods.loss_actor(by_pods)[0], bptt.loss_actor(rollout)[0]), (towards, ahac.loss_actor(rollout)[0])):
+        grads = (torch.autograd.grad(loss, list(actor.parameters()), allow_unused=True) for loss in pair)
+        flat = [torch.cat([x.flatten() for x in grad if x is not None]) for grad in grads]
+        torch.testing.assert_close(flat[0] / flat[0].norm(), flat[1] / flat[1].norm())
     compiled = HoveringEnv(num_envs=2, compile={"backend": "eager"})
     other = make_actor(compiled)
     flown, _ = differentiable_rollout(compiled, other, None, 3)

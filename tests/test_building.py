@@ -129,6 +129,12 @@ def test_a_run_levels_off_when_no_evaluation_has_risen_for_a_share_of_it():
     assert not looks_ahead(low + later, None)
     curve[7]["eval/solved"] = 0.52
     assert last_rise(curve) == 80 and last_rise([*curve, curve[-1] | {"eval/return": float("nan")}]) == 80
+    assert (
+        last_rise([*curve, curve[0] | {"eval/return": -math.inf}, {**curve[-1], "steps": 120, "eval/return": 99}])
+        == 120
+    )
+    offset = [row | {"eval/return": row["eval/return"] + 1000.0} for row in curve]  # 1 % of the return itself
+    assert last_rise(offset[:7]) == 20
 
 
 @cases(

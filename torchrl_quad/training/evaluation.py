@@ -60,12 +60,14 @@ def rounds(episodes: int | None, drones: int) -> int:
 
 
 def last_rise(rows: Sequence[Mapping[str, float]]) -> int:
-    """The step of a run's last evaluation that rose: by 1 % of the range of its returns, or of the episodes solved."""
+    """The step of a run's last evaluation that rose: by 1 % of the episodes solved, or of the return, which counts as
+    large as the range of returns at least."""
     rose, lowest, highest, solved = 0, math.inf, -math.inf, 0.0
     for row in rows:
-        found = row["eval/return"]
+        if not math.isfinite(found := row["eval/return"]):
+            continue
         lowest = min(lowest, found)
-        if found > highest + 0.01 * (highest - lowest if highest > lowest else 0.0):
+        if highest == -math.inf or found > highest + 0.01 * max(highest - lowest, abs(highest)):
             rose, highest = int(row["steps"]), found
         if row["eval/solved"] > solved + 0.01:
             rose, solved = int(row["steps"]), row["eval/solved"]

@@ -156,6 +156,7 @@ def test_one_step_towards_better_actions_goes_where_the_loss_itself_goes(env64):
     assert length[length > 0].median().item() == pytest.approx(0.3)  # those that do not act within the horizon apart
     by_pods = pods.write_action_target(rollout.copy()).detach()
     assert not torch.allclose(target, by_pods["action_target"])  # which has no value of the end
+    refuses("loss_fit reads 'action_target', which is not", ahac.loss_fit, rollout)
     towards = ahac.loss_fit(rollout.detach().set("action_target", target))
     for pair in ((pods.loss_actor(by_pods)[0], bptt.loss_actor(rollout)[0]), (towards, ahac.loss_actor(rollout)[0])):
         grads = (torch.autograd.grad(loss, list(actor.parameters()), allow_unused=True) for loss in pair)

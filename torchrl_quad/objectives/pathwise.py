@@ -303,7 +303,12 @@ class PathwiseLoss(LossModule):
         """Half the squared distance of the policy's actions from ``action_target`` in a rollout (*, horizon), whose
         other entries may be detached, and which several steps of an optimiser may share; a mean over those that count.
         """
-        target, counts = leaf(tensordict, self.tensor_keys.action_target), self._counts(tensordict)
+        if (key := self.tensor_keys.action_target) not in tensordict:
+            raise UserValueError(
+                f"loss_fit reads {key!r}, which is not in the rollout. Write it there while the rollout carries its "
+                f"graph: rollout.set({key!r}, loss.better_actions(rollout)[0])."
+            )
+        target, counts = leaf(tensordict, key), self._counts(tensordict)
         action = act_again(self.actor_network, self.actor_network_params, tensordict)[self.tensor_keys.action]
         distance = 0.5 * (action - target).square().sum(-1)
         return self._reduce_loss(mean_over_steps(distance, counts))

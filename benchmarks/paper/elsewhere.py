@@ -293,11 +293,13 @@ def train_one_setting(environment: str, seed: int) -> tuple[float, float, float]
     def iterate(_: float, carry: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         rollout, carry = differentiable_rollout(place.env, actor, carry, loss.horizon)
         scale.divide(rollout)
-        loss_actor, metrics = loss.loss_actor(rollout)
-        if backward(loss_actor, actor_optimizer, cfg.actor.max_grad_norm)[1].isfinite():
-            actor_optimizer.step()
+        target, metrics = loss.better_actions(rollout, cfg.step)
+        data = rollout.detach().set("action_target", target)
+        for _ in range(cfg.epochs):
+            if backward(loss.loss_fit(data), actor_optimizer, cfg.actor.max_grad_norm)[1].isfinite():
+                actor_optimizer.step()
         average.update_parameters(actor)
-        data = loss.write_value_target(rollout.detach())
+        data = loss.write_value_target(data)
         scale.update(data)
         for batch in minibatches(data, cfg.critic):
             optimise(critic_optimizer, loss.loss_value(batch)[0], cfg.critic.max_grad_norm)

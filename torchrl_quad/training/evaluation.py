@@ -110,12 +110,12 @@ def stalls(rows: Sequence[Mapping[str, float]], since: int, patience: float | No
 
 
 def looks_ahead(rows: Sequence[Mapping[str, float]], patience: float | None) -> bool:
-    """Whether a run has solved half of an evaluation's episodes, or has once levelled off without.
+    """Whether a run has solved nine tenths of an evaluation's episodes, or has once levelled off without.
 
     That is for half of its patience, and after 30 evaluations at the earliest.
     """
     level = (has_levelled_off(rows[:n], patience and patience / 2, solved=0.0, least=30) for n in range(len(rows) + 1))
-    return any(row["eval/solved"] >= 0.5 for row in rows) or any(level)
+    return any(row["eval/solved"] >= 0.9 for row in rows) or any(level)
 
 
 @contextlib.contextmanager

@@ -100,7 +100,7 @@ class Run:
         carry: where the next horizon starts; the algorithm sets it in each iteration.
         horizon: control steps of this iteration's rollout, ``cfg.horizon`` unless the algorithm sets it.
         levelled_off: whether its evaluations have, by ``eval.patience``; then it ends.
-        looks_ahead: whether nine tenths of an evaluation are solved, or it has once levelled off: time to look further ahead.
+        looks_ahead: whether nine tenths of an evaluation are solved, or it has once levelled off.
     """
 
     def __init__(

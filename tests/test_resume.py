@@ -140,8 +140,7 @@ def test_a_run_ends_when_its_evaluation_has_levelled_off_says_so_and_goes_on_wit
 def test_a_run_that_lost_a_third_of_what_it_solved_goes_back_to_its_best_policy_and_where_it_stalls_slower(
     train, launch, no_pictures, tmp_path, monkeypatch
 ):
-    script, saved = [0.4, 0.1, 0.84, 0.6, 0.55, 0.2, 0.9, 0.7], {}
-    save = loop.Run._save
+    script, saved, save = [0.4, 0.1, 0.84, 0.6, 0.55, 0.2, 0.9, 0.7], {}, loop.Run._save
 
     def keep(self, path):
         saved[self.iteration] = save(self, path) or read_checkpoint(path)

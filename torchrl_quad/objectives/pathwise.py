@@ -288,7 +288,7 @@ class PathwiseLoss(LossModule):
         return self._reduce_loss(-objective), metadata
 
     def better_actions(self, tensordict: TensorDictBase, step: float = 0.1) -> tuple[Tensor, dict[str, Tensor]]:
-        """Actions (*, horizon, k) that raise J, to fit the policy to by :meth:`loss_fit`, and the metadata.
+        """Actions (*, horizon, k) that raise J, to fit the policy to by :meth:`loss_fit` (Mora et al. 2021), and metadata.
 
         Each action of the rollout, which carries its graph, moves along the gradient of J in it; the median of these
         changes has the length ``step``, in units of the action.

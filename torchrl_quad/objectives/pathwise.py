@@ -288,10 +288,10 @@ class PathwiseLoss(LossModule):
         return self._reduce_loss(-objective), metadata
 
     def better_actions(self, tensordict: TensorDictBase, step: float = 0.1) -> tuple[Tensor, dict[str, Tensor]]:
-        """Actions (*, horizon, k) that raise J, to fit the policy to by :meth:`loss_fit` (Mora et al. 2021), and metadata.
+        """Actions (*, horizon, k) that raise J, to fit the policy to (Mora et al. 2021), and the metadata.
 
         Each action of the rollout, which carries its graph, moves along the gradient of J in it; the median of these
-        changes has the length ``step``, in units of the action.
+        changes has the length ``step``, in units of the action. :meth:`loss_fit` is the distance from them.
         """
         objective, metadata = self._objective(tensordict)
         action = leaf(tensordict, self.tensor_keys.action)

@@ -152,10 +152,10 @@ def test_a_run_has_lost_its_way_where_it_solves_a_third_less_and_its_return_fell
     assert has_lost_its_way(rows) == lost
 
 
-def test_a_run_stalls_when_no_evaluation_has_risen_for_half_of_its_patience_and_once_each_time():
+def test_a_run_stalls_when_no_evaluation_has_risen_for_two_thirds_of_its_patience_and_once_each_time():
     curve = [{"steps": 10 * i, "eval/return": min(i, 20.0), "eval/solved": 0.5} for i in range(1, 62)]
-    assert next(n for n in range(1, 62) if stalls(curve[:n], 0, 0.8)) == 34
-    assert next(n for n in range(1, 62) if stalls(curve[:n], 300, 0.8)) == 50
+    assert next(n for n in range(1, 62) if stalls(curve[:n], 0, 0.8)) == 43
+    assert next(n for n in range(1, 62) if stalls(curve[:n], 250, 0.8)) == 54
     assert not stalls(curve, 0, None) and not stalls([row | {"eval/solved": 0.4} for row in curve], 0, 0.5)
     rare = [row | {"steps": 100 * row["steps"], "eval/return": 1.0} for row in curve[1:]]
     assert next(n for n in range(1, 60) if stalls(curve[:1] + rare[:n], 0, 0.5)) == 10  # evaluations at least

@@ -100,13 +100,13 @@ def has_lost_its_way(rows: Sequence[Mapping[str, float]]) -> bool:
 def stalls(rows: Sequence[Mapping[str, float]], since: int, patience: float | None, least: int = 10) -> bool:
     """Whether a run that once solved half of an evaluation's episodes needs a lower rate.
 
-    That is where no evaluation has risen for half of its patience, and for ``least`` of them, nor since a step.
+    That is where no evaluation has risen for two thirds of its patience, and for ``least`` of them, nor since a step.
     """
     if patience is None or max(row["eval/solved"] for row in rows) < 0.5:
         return False
     since = max(since, last_rise(rows))
     waited = sum(row["steps"] > since for row in rows) >= least
-    return waited and since <= (1.0 - patience / 2) * rows[-1]["steps"]
+    return waited and since <= (1.0 - patience * 2 / 3) * rows[-1]["steps"]
 
 
 def looks_ahead(rows: Sequence[Mapping[str, float]], patience: float | None) -> bool:

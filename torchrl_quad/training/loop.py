@@ -310,12 +310,12 @@ class Run:
 
     def _roll_back(self, stateful: list[dict[str, Any]], slower: bool) -> None:
         """Go back to the best policy with its critics and optimisers, from fresh starts, perhaps at a quarter of its
-        rate."""
+        rate, at most twice."""
         for x, state in zip(self.stateful, stateful, strict=True):
             if slower and isinstance(x, Optimizer) and x.name == "actor":
                 self.slower_since = self.steps
                 for group in state["param_groups"]:
-                    group["share"] = group.get("share", 1.0) / 4
+                    group["share"] = max(group.get("share", 1.0) / 4, 1 / 16)
             x.load_state_dict(copy.deepcopy(state))
         # The weights of which the best policy was the mean may be poor.
         self.actor.load_state_dict(self.flown.state_dict())

@@ -24,7 +24,6 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from benchmarks.adaptation import Changed
 from benchmarks.paper.running import kept, run, side_by_side
 from benchmarks.report import RESULTS, command_line, publish
 from torchrl_quad import HoveringEnv, available_drones, load_drone
@@ -292,8 +291,12 @@ def in_mujoco(pilot: Any, n: int, name: str, changed: int | None = None) -> dict
     output = {"control": "rotor_thrusts", "gains": {}, **limits}
     rest = {"control_dt": DT, "plant": {}, "camera": None, "obstacles": None}
     contract = {"drone": fields, "output": output, **rest}
-    plain = simulator_class("mujoco")(contract, "contract", range(4))
-    simulator = plain if changed is None else Changed(contract, changed)
+    if changed is None:
+        simulator = simulator_class("mujoco")(contract, "contract", range(4))
+    else:
+        from benchmarks.adaptation import Changed
+
+        simulator = Changed(contract, changed)
     names = ("position", "quaternion", "velocity", "angular_velocity")
     simulator.reset({k: state[k].double().numpy() for k in names})
     waiting = Rotors(env.nominal).thrust(env.dynamics.controller.hover_speed).expand(n, 4)

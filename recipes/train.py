@@ -36,7 +36,8 @@ def main(cfg: DictConfig) -> None:
         data = rollout.detach().set("action_target", target)
         for _ in range(cfg.epochs):
             loss_actor = loss.loss_fit(data)
-            run.optimise(actor_optimizer, loss_actor)
+            if not run.optimise(actor_optimizer, loss_actor):
+                break
 
         # The critics: towards TD(lambda) targets, from the least of them.
         data = loss.write_value_target(data)

@@ -156,6 +156,9 @@ def test_one_step_towards_better_actions_goes_where_the_loss_itself_goes(env64):
     assert length[length > 0].median().item() == pytest.approx(0.3)  # those that do not act within the horizon apart
     by_pods = pods.write_action_target(rollout.copy()).detach()
     assert not torch.allclose(target, by_pods["action_target"])  # which has no value of the end
+    refuses("step must be greater than 0, got -1", ahac.better_actions, rollout, -1)
+    bonus = BPTTLoss(make_actor(env64, return_log_prob=True), alpha=0.1)
+    refuses("leaves out its entropy bonus: set alpha to 0", bonus.better_actions, rollout, error=NotImplementedError)
     refuses("loss_fit reads 'action_target', which is not", ahac.loss_fit, rollout)
     towards = ahac.loss_fit(rollout.detach().set("action_target", target))
     for pair in ((pods.loss_actor(by_pods)[0], bptt.loss_actor(rollout)[0]), (towards, ahac.loss_actor(rollout)[0])):

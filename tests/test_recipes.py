@@ -20,7 +20,7 @@ from torchrl_quad.envs import TASKS
 from torchrl_quad.envs.metrics import EPISODE_METRICS
 from torchrl_quad.files import read_rows
 from torchrl_quad.training.building import build_env
-from torchrl_quad.training.checkpoints import read_checkpoint
+from torchrl_quad.training.checkpoints import read_checkpoint, write_checkpoint
 from torchrl_quad.training.evaluation import drawing_from, evaluate
 from torchrl_quad.training.schema import LOSSES, settings
 
@@ -207,3 +207,14 @@ def test_abpt_tracks_and_lands(task, tmp_path):
     found = summary(tmp_path, "abpt", f"task={task}")
     assert found["solved"] >= 0.95
     assert task == "landing" or found["tracking_rmse"] < 0.05
+
+
+def test_what_an_older_recipe_wrote_can_be_flown_but_not_continued(train, launch, refused, tmp_path):
+    train("train", tmp_path)
+    path = tmp_path / "checkpoint.pt"
+    saved = read_checkpoint(path)
+    saved["config"] = "".join(line for line in saved["config"].splitlines(True) if not re.match("step:|epochs:", line))
+    write_checkpoint(path, saved, None)
+    assert "4 fresh episodes" in launch("evaluate", f"checkpoint={path}", "episodes=4")
+    said = refused("train", f"resume={path}", "total_steps=960")
+    assert f"{path} was written by an older train.py, which had no step, epochs. Continue it with that version" in said

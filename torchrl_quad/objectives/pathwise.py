@@ -291,8 +291,12 @@ class PathwiseLoss(LossModule):
         """Actions (*, horizon, k) that raise J, to fit the policy to (Mora et al. 2021), and the metadata.
 
         Each action of the rollout, which carries its graph, moves along the gradient of J in it; the median of these
-        changes has the length ``step``, in units of the action. :meth:`loss_fit` is the distance from them.
+        changes has the length ``step``, in units of the action. :meth:`loss_fit` is the distance from them. What J has
+        beside the flown actions, as ABPT has, does not count, and an entropy bonus is refused.
         """
+        if self.has_entropy_bonus:
+            raise Unsupported(f"better_actions of {type(self).__name__} leaves out its entropy bonus: set alpha to 0.")
+        step = check_value("step", step, Positive)
         objective, metadata = self._objective(tensordict)
         action = leaf(tensordict, self.tensor_keys.action)
         grad, measured = self._measure(action_gradient(objective.sum(), action))

@@ -162,7 +162,7 @@ def parameter_groups(name: str, module: nn.Module) -> list[dict[str, Any]]:
 class Optimizer(torch.optim.Adam):
     """Adam, a schedule that takes its learning rate from ``lr`` to ``final_lr`` over the run, and a bound on gradients.
 
-    The schedule ``inverse_sqrt`` is for runs of any length: from iteration 150 on it falls with one over its root.
+    The schedule ``inverse_sqrt`` is for runs of any length: from iteration 150 on it falls with its inverse root.
     ``name`` is the section of the network, "actor" or "critic"; ``module`` is that network, or the loss that holds it.
     """
 
@@ -203,7 +203,8 @@ class AdaptiveOptimizer(Optimizer):
 
     def anneal(self, iteration: float) -> None:
         """Set the limit of an iteration, counted from 0."""
-        self.limit = 1.5 * self.max_kl * max(1.0 - iteration / self.iterations, 0.02)
+        share = self.param_groups[0].get("share", 1.0)
+        self.limit = 1.5 * self.max_kl * max(1.0 - iteration / self.iterations, 0.02) * share
 
     def adapt(self, moved: float) -> None:
         """Adapt the learning rate to how far the horizon has moved the policy."""
@@ -244,7 +245,7 @@ class ReturnScale(nn.Module):
         """Take the value targets of a divided rollout in, and write them in the new unit."""
         before, target = self.value, leaf(data, "value_target")
         self.count += 1
-        mean = mean_of_all(target.double().square().mean()) * before**2
+        mean = mean_of_all(target.double().square().nan_to_num(0.0, 0.0, 0.0).mean()) * before**2
         self.square.lerp_(mean, torch.maximum(1 / self.count, torch.full_like(self.count, SMOOTHING)))
         factor = before / self.value
         for x in self.last:

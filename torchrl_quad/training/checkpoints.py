@@ -101,7 +101,8 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
             asked |= _leaves(OmegaConf.load(CONFIG / f"tuned/{value}.yaml"))
     asked |= {name: OmegaConf.select(cfg, name) for name, _, _ in overrides}  # which come after the tuned file
     path = Path(cfg.resume)
-    saved = saved_config(path, read_checkpoint(path), [*cfg.trust, *named_code(plain(cfg))])
+    content = read_checkpoint(path)
+    saved = saved_config(path, content, [*cfg.trust, *named_code(plain(cfg))])
     for key, value in asked.items():
         was = OmegaConf.select(saved, key)
         if value != was and key.split(".")[0] not in MAY_CHANGE:
@@ -111,6 +112,13 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
             )
         if value != was:
             OmegaConf.update(saved, key, value)
+    before = presets.parse(content["config"].encode(), str(path))
+    known = settings(str(saved.algorithm)).items()
+    if lacking := [name for name, default in known if default is not None and name not in before]:
+        raise UserValueError(
+            f"{path} was written by an older {saved.algorithm}.py, which had no {', '.join(lacking)}. Continue it with "
+            "that version, or start a new run without resume; evaluate.py and export.py read it."
+        )
     saved.resume = cfg.resume
     with open_dict(cfg):
         cfg.clear()
@@ -155,10 +163,9 @@ def saved_config(path: Path, content: Mapping[str, Any], trust: Collection[str] 
 
 
 def _with_newer(values: Mapping[str, Any], known: Mapping[str, Any]) -> dict[str, Any]:
-    """A configuration with the settings that came after it and are null, off, unless somebody sets them."""
-    off = {name: None for name, default in known.items() if default is None}
+    """A configuration with the settings that came after it, as they ship."""
     sections = {name: section for name, section in known.items() if isinstance(section, Mapping)}
-    return off | {
+    return dict(known) | {
         name: _with_newer(x, sections[name]) if name in sections and isinstance(x, Mapping) else x
         for name, x in values.items()
     }

@@ -60,8 +60,8 @@ def rounds(episodes: int | None, drones: int) -> int:
 
 
 def last_rise(rows: Sequence[Mapping[str, float]]) -> int:
-    """The step of a run's last evaluation that rose: by 1 % of the episodes solved, or of the return, which counts as
-    large as the range of returns at least."""
+    """The step of a run's last evaluation that rose: by 1 % of the episodes, or of the highest return or the range of
+    returns, whichever is larger."""
     rose, lowest, highest, solved = 0, math.inf, -math.inf, 0.0
     for row in rows:
         if not math.isfinite(found := row["eval/return"]):
@@ -92,15 +92,18 @@ def has_lost_its_way(rows: Sequence[Mapping[str, float]]) -> bool:
 
     Its return has also fallen by a tenth of the range: a race that just misses the last gate is not lost.
     """
-    solved, returns = ([row[f"eval/{name}"] for row in rows] for name in ("solved", "return"))
-    known = [x for x in returns if math.isfinite(x)] or [0.0]
-    return 0.5 <= max(solved) > 1.5 * solved[-1] and not returns[-1] >= max(known) - 0.1 * (max(known) - min(known))
+    known = [row for row in rows if math.isfinite(row["eval/return"])]
+    if not known or not 0.5 <= max(row["eval/solved"] for row in known) > 1.5 * rows[-1]["eval/solved"]:
+        return False
+    returns = [row["eval/return"] for row in known]
+    return not rows[-1]["eval/return"] >= max(returns) - 0.1 * (max(returns) - min(returns))
 
 
 def stalls(rows: Sequence[Mapping[str, float]], since: int, patience: float | None, least: int = 10) -> bool:
     """Whether a run that once solved half of an evaluation's episodes needs a lower rate.
 
-    That is where no evaluation has risen for two thirds of its patience, and for ``least`` of them, nor since a step.
+    No evaluation has risen for two thirds of the patience, and at least ``least`` of them have passed since the last
+    rise and since the step ``since``.
     """
     if patience is None or max(row["eval/solved"] for row in rows) < 0.5:
         return False

@@ -100,7 +100,7 @@ class Run:
         carry: where the next horizon starts; the algorithm sets it in each iteration.
         horizon: control steps of this iteration's rollout, ``cfg.horizon`` unless the algorithm sets it.
         levelled_off: whether its evaluations have, by ``eval.patience``; then it ends.
-        looks_ahead: whether nine tenths of an evaluation are solved, or it has once levelled off.
+        looks_ahead: whether nine tenths of an evaluation have once been solved, or it has levelled off.
     """
 
     def __init__(
@@ -196,7 +196,7 @@ class Run:
                         self.looks_ahead = looks_ahead(self.rows, self.cfg.eval.patience)
                         self.levelled_off = has_levelled_off(self.rows, self.cfg.eval.patience)
                         slower = stalls(self.rows, self.slower_since, self.cfg.eval.patience)
-                        if slower or has_lost_its_way(self.rows):
+                        if slower or (self.cfg.eval.patience is not None and has_lost_its_way(self.rows)):
                             best = self.best.get("stateful")
                     known = self.looks_ahead, self.levelled_off, best, slower
                     self.looks_ahead, self.levelled_off, best, slower = of_first(known)
@@ -211,23 +211,24 @@ class Run:
             self._finish()
             print(f"{time.perf_counter() - began:.0f} s in all, {self.seconds:.0f} s of them training.")
 
-    def optimise(self, optimizer: Optimizer, loss: Tensor) -> None:
+    def optimise(self, optimizer: Optimizer, loss: Tensor) -> bool:
         """Take one step down a loss with its clipped gradient, averaged over all processes; record the norm.
 
         The step is skipped if the loss or its gradient is not finite; more than ``max_skipped`` of them end the run.
+        Returns whether it was taken.
         """
         both = torch.stack(backward(loss, optimizer, optimizer.max_grad_norm))
         value, norm = both.tolist()  # in one call, so that it waits for a GPU once
         if math.isfinite(value) and math.isfinite(norm):
             self.record(**{f"grad_{optimizer.name}": norm})
             optimizer.step()
-            return
+            return True
         self.skipped += 1
         parameters = self.loss.named_parameters()
         broken = [key for key, p in parameters if p.grad is not None and not p.grad.isfinite().all()]
         optimizer.zero_grad()
         if self.skipped <= self.cfg.max_skipped:
-            return
+            return False
         path = self.folder / "failure.pt"
         self._save(path)
         raise Diverged(
@@ -309,8 +310,10 @@ class Run:
         return metrics
 
     def _roll_back(self, stateful: list[dict[str, Any]], slower: bool) -> None:
-        """Go back to the best policy with its critics and optimisers, from fresh starts, perhaps at a quarter of its
-        rate, at most twice."""
+        """Go back to the best policy with its critics and optimisers, from fresh starts.
+
+        ``slower`` takes a quarter of its rate, but no less than a sixteenth of the first.
+        """
         for x, state in zip(self.stateful, stateful, strict=True):
             if slower and isinstance(x, Optimizer) and x.name == "actor":
                 self.slower_since = self.steps

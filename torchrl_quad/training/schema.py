@@ -176,7 +176,11 @@ IDLE: list[tuple[str, Callable[[Any], bool], str]] = [
         "a policy that sees nothing has a memory only with actor.recurrent=true",
     ),
     ("loss.alpha_init loss.target_entropy", lambda c: c["loss"].get("alpha") != "auto", "loss.alpha is not auto"),
-    ("loss.alpha loss.average_over_horizon", lambda c: c["algorithm"] == "train", "the policy is fitted to actions"),
+    (
+        "loss.alpha loss.average_over_horizon actor.max_kl",
+        lambda c: c["algorithm"] == "train",
+        "the policy is fitted to actions",
+    ),
     ("loss.entropy_coeff", lambda c: c["loss"].get("entropy_bonus") is False, "loss.entropy_bonus=false"),
     ("env.difficulty", lambda c: c["env"].get("density") is not None, "env.density is set"),
     ("logger.project logger.group logger.mode", lambda c: c["logger"]["backend"] != "wandb", "it is wandb's"),

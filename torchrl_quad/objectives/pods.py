@@ -96,7 +96,7 @@ class PODSLoss(PathwiseLoss):
         return tensordict.set(self.tensor_keys.action_target, action.detach() + change.nan_to_num(0.0, 0.0, 0.0))
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """:meth:`loss_fit` and its metadata; targets that are missing are added."""
+        """``loss_fit`` and its metadata; targets that are missing are added."""
         if self.tensor_keys.action_target not in tensordict:
             tensordict = self.write_action_target(tensordict.copy())
         rewards = self._discounts(tensordict) * self._next(tensordict, "reward")

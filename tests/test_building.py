@@ -149,7 +149,7 @@ def test_a_run_levels_off_when_no_evaluation_has_risen_for_a_share_of_it():
 )
 def test_a_run_has_lost_its_way_where_it_solves_a_third_less_and_its_return_fell(lost, solved, returns):
     rows = [{"eval/solved": x, "eval/return": y} for x, y in zip(solved, returns, strict=True)]
-    assert has_lost_its_way(rows) == lost
+    assert has_lost_its_way(rows, 0.5) == lost and not has_lost_its_way(rows, None)
 
 
 def test_a_run_stalls_when_no_evaluation_has_risen_for_two_thirds_of_its_patience_and_once_each_time():

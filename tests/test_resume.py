@@ -163,7 +163,7 @@ def test_a_run_that_lost_a_third_of_what_it_solved_goes_back_to_its_best_policy_
         stop_at_save(patch, 6)
         with pytest.raises(SystemExit):
             train("train", tmp_path / "stopped", *options)
-    seen.pop()  # of that checkpoint
+    seen.pop()  # the evaluation before that checkpoint
     train("train", tmp_path / "stopped", *options, "resume=auto")
     assert_equal(straight, saved[8])
 

@@ -162,7 +162,7 @@ def parameter_groups(name: str, module: nn.Module) -> list[dict[str, Any]]:
 class Optimizer(torch.optim.Adam):
     """Adam, a schedule that takes its learning rate from ``lr`` to ``final_lr`` over the run, and a bound on gradients.
 
-    The schedule ``inverse_sqrt`` is for runs of any length: from iteration 150 on it falls with its inverse root.
+    The schedule ``inverse_sqrt`` is for runs of any length: constant, and from iteration 150 on one over its root.
     ``name`` is the section of the network, "actor" or "critic"; ``module`` is that network, or the loss that holds it.
     """
 

@@ -87,13 +87,18 @@ def has_levelled_off(
     return last_rise(rows) <= (1.0 - patience) * rows[-1]["steps"]
 
 
-def has_lost_its_way(rows: Sequence[Mapping[str, float]]) -> bool:
-    """Whether a run that once solved half of an evaluation's episodes solves less than two thirds of its best.
+def has_lost_its_way(rows: Sequence[Mapping[str, float]], patience: float | None) -> bool:
+    """Whether a run that once solved half of an evaluation's episodes solves less than two thirds of its best; never
+    where ``patience`` is None.
 
     Its return has also fallen by a tenth of the range: a race that just misses the last gate is not lost.
     """
     known = [row for row in rows if math.isfinite(row["eval/return"])]
-    if not known or not 0.5 <= max(row["eval/solved"] for row in known) > 1.5 * rows[-1]["eval/solved"]:
+    if (
+        patience is None
+        or not known
+        or not 0.5 <= max(row["eval/solved"] for row in known) > 1.5 * rows[-1]["eval/solved"]
+    ):
         return False
     returns = [row["eval/return"] for row in known]
     return not rows[-1]["eval/return"] >= max(returns) - 0.1 * (max(returns) - min(returns))
@@ -117,7 +122,7 @@ def looks_ahead(rows: Sequence[Mapping[str, float]], patience: float | None) -> 
 
     That is for half of its patience, and after 30 evaluations at the earliest.
     """
-    level = (has_levelled_off(rows[:n], patience and patience / 2, solved=0.0, least=30) for n in range(len(rows) + 1))
+    level = (has_levelled_off(rows[:n], patience and patience / 2, solved=0.0) for n in range(len(rows) + 1))
     return any(row["eval/solved"] >= 0.9 for row in rows) or any(level)
 
 

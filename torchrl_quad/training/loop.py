@@ -66,16 +66,8 @@ from torchrl_quad.training.evaluation import (
 )
 from torchrl_quad.training.logs import Logs
 
-PROGRESS = (  # of a checkpoint
-    "iteration",
-    "steps",
-    "skipped",
-    "seconds",
-    "processor_seconds",
-    "rows",
-    "best",
-    "slower_since",
-)
+# Of a checkpoint.
+PROGRESS = ("iteration", "steps", "skipped", "seconds", "processor_seconds", "rows", "best", "slower_since")
 CELL = 0.5  # [m]: train/start_cells counts the cubes of this size in which horizons have started
 
 
@@ -196,7 +188,7 @@ class Run:
                         self.looks_ahead = looks_ahead(self.rows, self.cfg.eval.patience)
                         self.levelled_off = has_levelled_off(self.rows, self.cfg.eval.patience)
                         slower = stalls(self.rows, self.slower_since, self.cfg.eval.patience)
-                        if slower or (self.cfg.eval.patience is not None and has_lost_its_way(self.rows)):
+                        if slower or has_lost_its_way(self.rows, self.cfg.eval.patience):
                             best = self.best.get("stateful")
                     known = self.looks_ahead, self.levelled_off, best, slower
                     self.looks_ahead, self.levelled_off, best, slower = of_first(known)

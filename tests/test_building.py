@@ -27,7 +27,7 @@ from torchrl_quad.training.building import (
     minibatches,
     shuffled,
 )
-from torchrl_quad.training.evaluation import has_levelled_off, has_lost_its_way, last_rise, looks_ahead, stalls
+from torchrl_quad.training.evaluation import has_levelled_off, has_lost_its_way, last_rise, looks_ahead, merit, stalls
 from torchrl_quad.training.loop import Run, backward
 
 
@@ -150,6 +150,13 @@ def test_a_run_levels_off_when_no_evaluation_has_risen_for_a_share_of_it():
 def test_a_run_has_lost_its_way_where_it_solves_a_third_less_and_its_return_fell(lost, solved, returns):
     rows = [{"eval/solved": x, "eval/return": y} for x, y in zip(solved, returns, strict=True)]
     assert has_lost_its_way(rows, 0.5) == lost and not has_lost_its_way(rows, None)
+
+
+def test_the_best_policy_solves_most_and_with_a_patience_to_the_nearest_2_percent():
+    early, late = {"solved": 1.0, "return": 112.7}, {"solved": 127 / 128, "return": 141.5}
+    none, first = {"solved": 125 / 128, "return": 150.0}, {"solved": -math.inf, "return": -math.inf}
+    assert max([first, early, late, none], key=lambda score: merit(score, None)) == early
+    assert max([first, early, late, none], key=lambda score: merit(score, 0.5)) == late
 
 
 def test_a_run_stalls_when_no_evaluation_has_risen_for_two_thirds_of_its_patience_and_once_each_time():

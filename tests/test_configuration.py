@@ -1,17 +1,16 @@
 """The schema of the configuration: what is refused, and what is said instead."""
 
 import pytest
-import yaml
 from omegaconf import OmegaConf
 from refusals import cases, refuses
 
 from torchrl_quad import load_drone
 from torchrl_quad.envs import TASKS
-from torchrl_quad.training.configuration import CONFIG, compose
+from torchrl_quad.training.configuration import compose, plain, tuned
 from torchrl_quad.training.launch import _joined
 from torchrl_quad.training.schema import IDLE, LOSSES, check, schema_of, settings
 
-TUNED = sorted((CONFIG / "tuned").glob("*.yaml"))
+TUNED = tuned()
 RECIPES = sorted(LOSSES)
 
 REFUSED = [  # of ABPT, unless a recipe is named
@@ -102,20 +101,17 @@ def test_every_setting_that_another_may_switch_off_is_one():
             assert shipped or name in ("env.difficulty", "loss.entropy_coeff"), name
 
 
-@pytest.mark.parametrize("path", TUNED, ids=[path.stem for path in TUNED])
-def test_every_configuration_that_ships_passes_the_schema_with_its_tuned_values(path):
-    recipe, task = path.stem.split("_", 1)
-    task, *variant = task.split("_", 1)
-    assert recipe in RECIPES and task in TASKS  # or nobody would ever read the file
-    cfg = composed(recipe, f"task={task}", *([f"tuned={path.stem}"] if variant else []))
+@pytest.mark.parametrize("name", TUNED)
+def test_every_configuration_that_ships_passes_the_schema_with_its_tuned_values(name):
+    recipe, task, *variant = name.split("_", 2)
+    assert recipe in RECIPES and task in TASKS  # or nobody would ever read the section
+    cfg = composed(recipe, f"task={task}", *([f"tuned={name}"] if variant else []))
     check(cfg)
-    tuned = yaml.safe_load(path.read_text())
-    tuned.pop("defaults", None)
-    assert OmegaConf.merge(cfg, tuned) == cfg
+    assert OmegaConf.merge(cfg, {key: x for key, x in plain(TUNED[name]).items() if key != "defaults"}) == cfg
 
 
 def test_recipes_pass_the_schema_on_tasks_that_they_are_not_tuned_for_and_one_has_the_same_numbers_for_all():
-    missing = {(recipe, task) for recipe in RECIPES for task in TASKS} - {tuple(path.stem.split("_")) for path in TUNED}
+    missing = {(recipe, task) for recipe in RECIPES for task in TASKS} - {tuple(name.split("_")) for name in TUNED}
     found = {run: composed(run[0], f"task={run[1]}") for run in sorted(missing)}
     for cfg in found.values():
         check(cfg)

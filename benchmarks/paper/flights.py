@@ -23,11 +23,11 @@ from torchrl_quad import differentiable_rollout
 from torchrl_quad.envs.racing import load_track
 from torchrl_quad.files import add_rows, machine, read_rows
 from torchrl_quad.training.building import build_env
-from torchrl_quad.training.configuration import CONFIG
+from torchrl_quad.training.configuration import tuned
 from torchrl_quad.training.evaluation import drawing_from, evaluate, load_policy
 
 METHODS = {name: name.upper() for name in ("bptt", "shac", "abpt", "sapo", "ahac")}
-METHODS |= {"pods": "PODS", "hybrid": "Hybrid", "ppo": "PPO", "train": "One setting"}  # train.py has no tuned files
+METHODS |= {"pods": "PODS", "hybrid": "Hybrid", "ppo": "PPO", "train": "One setting"}
 TASKS = {  # what is shown of each with the solved episodes: column, factor, digits, unit
     "hovering": ("position_error", 100, 1, "cm"),
     "tracking": ("tracking_rmse", 100, 1, "cm"),
@@ -60,8 +60,7 @@ RUN = ("task", "algorithm", "seed")  # what tells one run from another
 
 def overrides(task: str, method: str) -> list[str]:
     """Name the task to a recipe; a variant of a task may have tuned values of its own."""
-    tuned = f"{method}_{task}"
-    own = [f"tuned={tuned}"] if task in VARIANTS and (CONFIG / f"tuned/{tuned}.yaml").exists() else []
+    own = [f"tuned={name}"] if task in VARIANTS and (name := f"{method}_{task}") in tuned() else []
     return [*VARIANTS.get(task, [f"task={task}"]), *own]
 
 

@@ -19,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from torchrl_quad.dynamics import presets
 from torchrl_quad.errors import UserError, UserValueError
 from torchrl_quad.files import replacing
-from torchrl_quad.training.configuration import CONFIG, named_code, plain
+from torchrl_quad.training.configuration import named_code, plain, tuned
 from torchrl_quad.training.schema import check, settings
 
 FORMAT = 5  # of the content; raise it when older files can no longer be read
@@ -95,11 +95,10 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
     if cfg.resume is None:
         return
     overrides = [override.lstrip("+~").partition("=") for override in HydraConfig.get().overrides.task]
-    asked: dict[str, Any] = {"algorithm": cfg.algorithm}
+    names = ["algorithm", *(name for name, _, _ in overrides)]
     for name, _, value in overrides:
-        if name == "tuned" and value != "null":
-            asked |= _leaves(OmegaConf.load(CONFIG / f"tuned/{value}.yaml"))
-    asked |= {name: OmegaConf.select(cfg, name) for name, _, _ in overrides}  # which come after the tuned file
+        names += _leaves(plain(tuned()[value])) if name == "tuned" and value != "null" else []
+    asked = {name: OmegaConf.select(cfg, name) for name in names}
     path = Path(cfg.resume)
     content = read_checkpoint(path)
     saved = saved_config(path, content, [*cfg.trust, *named_code(plain(cfg))])
@@ -125,12 +124,12 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
         cfg.update(saved)
 
 
-def _leaves(node: Any, section: str = "") -> dict[str, Any]:
-    """The settings of a YAML file by their whole names."""
-    found = {}
+def _leaves(node: Mapping[str, Any], section: str = "") -> list[str]:
+    """The whole names of the settings that are tuned."""
+    found = []
     for name, value in node.items():
-        inner = _leaves(value, f"{section}{name}.") if OmegaConf.is_dict(value) else {f"{section}{name}": value}
-        found |= {} if name == "defaults" else inner
+        inner = _leaves(value, f"{section}{name}.") if isinstance(value, dict) else [f"{section}{name}"]
+        found += [] if name == "defaults" else inner
     return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -36,7 +37,7 @@ def compose(recipe: str, overrides: Iterable[str] = ()) -> DictConfig:
 
 
 def command_line(arguments: Iterable[str]) -> list[str]:
-    """A command line in hydra's grammar, with a configuration on offer for each task that ships or is named on it."""
+    """A command line in hydra's grammar, with all tasks that ship or are named on it, and what is tuned, on offer."""
     arguments = [re.sub(r"^task\._target_=", "task=", hydra_argument(argument)) for argument in arguments]
     if any(argument.startswith("loss._target_=") for argument in arguments):
         arguments = [re.sub(r"^loss\.", "++loss.", argument) for argument in arguments]  # the files lack its options
@@ -46,7 +47,16 @@ def command_line(arguments: Iterable[str]) -> list[str]:
         if name in asked.split(",") or name in available_tasks() or "." in name:
             node = {"task": name, "env": defaults(task_class(name))}
             ConfigStore.instance().store(group="task", name=name, node=node, package="_global_")
+    for name, node in tuned().items():
+        ConfigStore.instance().store(group="tuned", name=name, node=node, package="_global_")
     return arguments
+
+
+@functools.cache
+def tuned() -> dict[str, DictConfig]:
+    """What is tuned for a recipe and a task, by the name RECIPE_TASK: the sections of the recipe's file in tuned/."""
+    files = {path.stem: OmegaConf.load(path) for path in sorted((CONFIG / "tuned").glob("*.yaml"))}
+    return {f"{recipe}_{name}": section for recipe, sections in files.items() for name, section in sections.items()}
 
 
 def plain(cfg: Any, **options: Any) -> dict[str, Any]:

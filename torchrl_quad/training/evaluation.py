@@ -59,6 +59,16 @@ def rounds(episodes: int | None, drones: int) -> int:
     return -(-(episodes or 1) // drones)
 
 
+def merit(score: Mapping[str, float], patience: float | None) -> tuple[float, float]:
+    """What makes a policy the best of a run: first the episodes solved, then the return.
+
+    With a ``patience`` the run goes back to that policy, so the episodes count to the nearest 2 %: one evaluation that
+    happened to solve all would hold it for good.
+    """
+    solved = score["solved"]
+    return solved if patience is None or math.isinf(solved) else round(50 * solved), score["return"]
+
+
 def last_rise(rows: Sequence[Mapping[str, float]]) -> int:
     """The step of a run's last evaluation that rose: by 1 % of the episodes, or of the highest return or the range of
     returns, whichever is larger."""

@@ -58,6 +58,7 @@ from torchrl_quad.training.evaluation import (
     has_lost_its_way,
     last_rise,
     looks_ahead,
+    merit,
     print_summary,
     rounds,
     stalls,
@@ -76,9 +77,9 @@ class Run:
 
     Every ``eval.interval`` iterations the run writes a row of metrics and a checkpoint, which holds all that it needs
     to continue bit for bit, and the best policy so far: the one that solved most episodes in an evaluation, and of
-    those the one with the greatest return. At the end that policy flies from other starts. With ``eval.patience``, a
-    run that has lost its way goes back to it, with its critics and optimisers; so does a run that has stalled, at a
-    quarter of the actor's rate.
+    those the one with the greatest return. At the end that policy flies from other starts. With ``eval.patience``,
+    episodes solved count to the nearest 2 %, and a run that has lost its way goes back to its best policy, with its
+    critics and optimisers; so does a run that has stalled, at a quarter of the actor's rate.
 
     The seconds are those of the loop, without set-up, compilation, evaluations and checkpoints.
 
@@ -292,12 +293,12 @@ class Run:
             drawing.draw_flight(flight, self.folder / "flight", self.env, title(now))
             self.logs.show_flight(self.steps)
         score = {name: metrics[f"eval/{name}"] for name in ("solved", "return")}
-        record = self.best["solved"], self.best["return"]
-        if math.isfinite(score["return"]) and tuple(score.values()) >= record:
+        patience = self.cfg.eval.patience
+        if math.isfinite(score["return"]) and merit(score, patience) >= merit(self.best, patience):
             policy = {"actor": self.flown, "normalizer": self.normalizer}
             weights = {name: copy.deepcopy(x.state_dict()) for name, x in policy.items() if x is not None}
             self.best = {**score, "steps": self.steps, **weights}
-            if self.cfg.eval.patience is not None:
+            if patience is not None:
                 self.best["stateful"] = copy.deepcopy([x.state_dict() for x in self.stateful])
         return metrics
 

@@ -40,7 +40,7 @@ from torchrl_quad.options import (
     declared,
     must,
 )
-from torchrl_quad.training.configuration import CONFIG, OWN, SET_BY_RECIPES, own_class, own_disturbances, plain
+from torchrl_quad.training.configuration import CONFIG, OWN, SET_BY_RECIPES, own_class, own_disturbances, plain, tuned
 
 
 class Section(BaseModel):
@@ -232,7 +232,7 @@ def schema_of(values: dict[str, Any], asked: Mapping[str, str] = MappingProxyTyp
     kinds: dict[str, tuple[Any, str]] = {"env": (_environment(values), ""), "loss": (dict[str, Any], "")}
     if config in LOSSES:
         kinds["loss"] = _loss(LOSSES[config], own.get("loss") or {}, values.get("loss"), asked), ""
-    # What the tuned file of another recipe sets, which this one starts from, is left alone. A recipe that is somebody's
+    # What is tuned for another recipe, which this one starts from, is left alone. A recipe that is somebody's
     # own, in another program, may lack anything.
     spare = {name for name in SETTINGS if name.startswith("critic.") and name not in asked}
     return _section(settings(values["algorithm"]), SETTINGS | kinds, spare, config in LOSSES)
@@ -306,10 +306,11 @@ def _check_together(values: dict[str, Any], asked: Mapping[str, str]) -> None:
             raise UserValueError(
                 f"{name}.final_lr=0: it must be above 0 with schedule=exponential, which never reaches 0. Try 1e-6."
             )
-    tuned, files = asked.get("tuned", "null"), sorted(path.stem for path in (CONFIG / "tuned").glob("*.yaml"))
-    if tuned not in ("null", *files):
-        close = difflib.get_close_matches(tuned, files, 1) or files
-        raise UserValueError(f"tuned={tuned}: {CONFIG / 'tuned'} has no such file. Choose from: {', '.join(close)}.")
+    if (name := asked.get("tuned", "null")) not in ("null", *tuned()):
+        close = difflib.get_close_matches(name, tuned(), 1) or tuned()
+        raise UserValueError(
+            f"tuned={name}: no file in {CONFIG / 'tuned'} has such a section. Choose from: {', '.join(close)}."
+        )
     for names, is_idle, why in IDLE:
         for name in set(names.split()) & asked.keys():
             if is_idle(values):

@@ -30,6 +30,9 @@ from torchrl_quad import HoveringEnv, available_drones, load_drone
 from torchrl_quad.deploy.simulators import simulator_class
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.rigid_body import Rotors
+from torchrl_quad.engine.simulation import State
+from torchrl_quad.envs.disturbances import Disturbance
+from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.files import add_rows, machine, read_rows
 from torchrl_quad.render.canvas import make_figure
 from torchrl_quad.render.canvas import save as save_figure
@@ -48,13 +51,25 @@ SPIN = [-1.0, 1.0, -1.0, 1.0]
 Motion = tuple[Tensor, Tensor, Tensor, Tensor]  # position from the target, quaternion, velocity, body rates: (n, k)
 
 
+class Worn(Disturbance):
+    """A rotor that gives 70 to 100 % of its thrust, and a centre of mass up to a tenth of the arm off the middle."""
+
+    def start(self, random: Randomness, state: State) -> State:
+        places = state["drone", "rotor_positions"]
+        which, lost = random.uniform(len(places), 4), 0.15 + 0.15 * random.uniform(len(places), 1)
+        weak = torch.nn.functional.one_hot(which.argmax(-1), 4)
+        arm = places.norm(dim=-1, keepdim=True).mean(1, keepdim=True)
+        off = 0.1 * arm * random.uniform(len(places), 1, 2)
+        return {("drone", "rotor_effectiveness"): 1.0 - lost * weak, ("drone", "rotor_positions"): places + off}
+
+
 class Ours:
     """A trained policy, with its memory and the commands that it has given; tells shares of thrust (n, 4)."""
 
     tells_speed = False
 
     def __init__(self, checkpoint: Path) -> None:
-        cfg, self.actor, _ = load_policy(checkpoint)
+        cfg, self.actor, _ = load_policy(checkpoint, trust=["benchmarks.any_drone.Worn"])
         self.env = task_of(build_env(cfg, 1, 0))
         self.size = sum(p.numel() for p in self.actor.parameters())
         self.remembered: list[Tensor] | None = None  # its memory after each of the first 100 steps, for the probe
@@ -381,7 +396,15 @@ ARENAS: dict[tuple[str, str], Callable[..., dict[str, float]]] = {
     **{("mujoco", x): functools.partial(in_mujoco, name=x) for x in SHIPPED},
     **{("changed", str(x)): functools.partial(in_mujoco, name="visfly", changed=x) for x in range(10)},
 }
-POLICIES = {"large": [], "small": ["actor.num_cells=[24]", "actor.hidden_size=24"], "raptor": [], "informed": []}
+WINDY = [  # trained in wind, and with a weak rotor and a centre of mass off the middle
+    "env.wind={spread: [4,4,1], gust: 0.5}",
+    "env.disturbances=[benchmarks.any_drone.Worn]",
+    "critic.in_keys=[observation,[state,traits],[state,rotor_speed],[reward_terms,position],[state,wind],"
+    "[state,drone,rotor_effectiveness]]",
+    "critic.input_scale=[0.5,1.0,0.001,100.0,0.3,3.0]",
+]
+POLICIES = {"large": [], "small": ["actor.num_cells=[24]", "actor.hidden_size=24"], "windy": WINDY}
+POLICIES |= {"raptor": [], "informed": []}
 PILOTS = {"raptor": Raptor, "informed": Informed}  # that are not trained here
 KEY = ("policy", "seed", "drones", "drone")
 

@@ -45,7 +45,7 @@ def run(tmp_path, monkeypatch):
     ("memory", "--num-envs 4 --modes eager --horizon 2 --rounds 1", 1),
     pytest.param("camera", "--primitives 2 --scenes trees --images 2x4x3 --rounds 1", 1, marks=pytest.mark.slow),
     ("racing", f"--tracks visfly --steps 16 --episodes 2 --cores 1 --runs runs --overrides {SMALL}", 1),
-    ("any_drone", f"--policies small informed --drones any mujoco --episodes 2 --overrides total_steps=16 {SMALL}", 16),
+    ("any_drone", f"--policies windy informed --drones any mujoco --episodes 2 --overrides total_steps=16 {SMALL}", 16),
     pytest.param("any_drone", "--policies raptor --drones l2f --episodes 2", 1, marks=THEIRS),
     ("time_to_solve", f"--algorithms bptt --modes eager --overrides {SMALL} total_steps=16", 1),
     ("profile_recipes", f"--algorithms bptt --iterations 2 --skip 1 --overrides {SMALL}", 1),

@@ -52,7 +52,8 @@ Motion = tuple[Tensor, Tensor, Tensor, Tensor]  # position from the target, quat
 
 
 class Worn(Disturbance):
-    """A rotor that gives 70 to 100 % of its thrust, and a centre of mass up to a tenth of the arm off the middle."""
+    """A rotor that gives 70 to 100 % of its thrust, and a centre of mass off the middle, by up to a tenth of the arm
+    along x and y."""
 
     def start(self, random: Randomness, state: State) -> State:
         places = state["drone", "rotor_positions"]
@@ -403,8 +404,13 @@ WINDY = [  # trained in wind, and with a weak rotor and a centre of mass off the
     "[state,drone,rotor_effectiveness]]",
     "critic.input_scale=[0.5,1.0,0.001,100.0,0.3,3.0]",
 ]
-POLICIES = {"large": [], "small": ["actor.num_cells=[24]", "actor.hidden_size=24"], "windy": WINDY}
-POLICIES |= {"raptor": [], "informed": []}
+POLICIES = {
+    "large": [],
+    "small": ["actor.num_cells=[24]", "actor.hidden_size=24"],
+    "windy": WINDY,
+    "raptor": [],
+    "informed": [],
+}
 PILOTS = {"raptor": Raptor, "informed": Informed}  # that are not trained here
 KEY = ("policy", "seed", "drones", "drone")
 

@@ -69,6 +69,7 @@ def test_a_setting_out_of_its_range_is_refused_with_what_to_write_instead(words,
 
 
 IGNORED = {  # what a person wrote, which nothing would read
+    "abpt tuned=abpt": "tuned=abpt: nothing has this name in .*by_task. Choose from: abpt_",
     "bptt +epochs=3": "epochs is unknown: this recipe has no such setting",
     "bptt +critic.updates=3": "critic is unknown: this recipe has no such setting. Leave it out.",
     "sapo +critic.tau=0.1": "critic.tau is unknown",

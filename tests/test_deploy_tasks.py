@@ -16,7 +16,8 @@ from own_task import CornerEnv, RelayEnv
 from refusals import refuses
 from small_runs import ROOT
 from torch import nn
-from torchrl.envs.utils import ExplorationType
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import set_recurrent_mode
 
 from torchrl_quad import ForestEnv, HoveringEnv, RacingEnv, TrackingEnv, differentiable_rollout, make_env
 from torchrl_quad.deploy import WrongActions, contract, export, export_policy, load_bundle, transfer
@@ -348,6 +349,23 @@ def test_a_bundle_that_acts_or_remembers_differently_from_its_policy_is_not_writ
             with pytest.raises(error, match=said):
                 export_policy(actor, env, tmp_path / "policy")
         assert not list(tmp_path.iterdir())
+    assert export_policy(actor, env, tmp_path / "policy").is_dir()
+
+
+def test_a_policy_whose_memory_amplifies_rounding_errors_is_exported(tmp_path, trace_once):
+    trace_once("hovering")
+    env, _ = build("hovering, with memory")
+    actor = make_actor(env, (16, 16), recurrent=True, hidden_size=32)
+    with torch.no_grad():
+        actor.last.mlp[-1].weight.add_(0.3 * torch.randn_like(actor.last.mlp[-1].weight))
+        next(x for name, x in actor.named_parameters() if "weight_hh" in name).mul_(20.0)
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        flight, _ = differentiable_rollout(env, actor, None, 48)
+        flown, seen = (flight.select(*actor.in_keys).clone() for _ in range(2))
+        seen["observation"][:, 0] += 1e-6
+        with set_recurrent_mode(True):
+            gap = (actor(seen)["action"] - actor(flown)["action"])[:2].abs().amax((0, 2))
+    assert gap.max() > 1e-3 > 100 * gap[0], gap
     assert export_policy(actor, env, tmp_path / "policy").is_dir()
 
 

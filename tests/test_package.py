@@ -72,7 +72,7 @@ def test_the_wheel_works_away_from_the_repository_and_so_does_a_recipe_of_your_o
     shown = yaml.safe_load(run(*command, cwd=tmp_path, env=environment))
     assert (shown["algorithm"], shown["loss"]["smoothness"]) == ("smooth", 0.1)
     assert shown["env"]["max_episode_steps"] == 512
-    assert shown["eval"]["interval"] == 20  # of bptt_racing.yaml
+    assert shown["eval"]["interval"] == 20  # of racing in by_task/bptt.yaml
 
 
 def test_every_python_that_the_package_names_can_have_the_tested_versions():

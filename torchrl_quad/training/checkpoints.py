@@ -125,11 +125,13 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
 
 
 def _leaves(node: Mapping[str, Any], section: str = "") -> list[str]:
-    """The whole names of the settings that are tuned."""
+    """The whole names of the settings that a section sets, or the sections it begins with."""
     found = []
     for name, value in node.items():
-        inner = _leaves(value, f"{section}{name}.") if isinstance(value, dict) else [f"{section}{name}"]
-        found += [] if name == "defaults" else inner
+        if name == "defaults":
+            found += [x for other in value if other != "_self_" for x in _leaves(plain(tuned()[other]))]
+        else:
+            found += _leaves(value, f"{section}{name}.") if isinstance(value, dict) else [f"{section}{name}"]
     return found
 
 

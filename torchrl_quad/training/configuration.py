@@ -54,9 +54,14 @@ def command_line(arguments: Iterable[str]) -> list[str]:
 
 @functools.cache
 def tuned() -> dict[str, DictConfig]:
-    """What is tuned for a recipe and a task, by the name RECIPE_TASK: the sections of the recipe's file in tuned/."""
-    files = {path.stem: OmegaConf.load(path) for path in sorted((CONFIG / "tuned").glob("*.yaml"))}
-    return {f"{recipe}_{name}": section for recipe, sections in files.items() for name, section in sections.items()}
+    """What is tuned for a recipe and a task, by the name RECIPE_TASK: the sections of the recipe's file in by_task/."""
+    found = {}
+    for path in sorted((CONFIG / "by_task").glob("*.yaml")):
+        for name, section in OmegaConf.load(path).items():
+            if not OmegaConf.is_dict(section):
+                raise UserValueError(f"{path}: {name} is no section. Indent settings below the name of their task.")
+            found[f"{path.stem}_{name}"] = section
+    return found
 
 
 def plain(cfg: Any, **options: Any) -> dict[str, Any]:

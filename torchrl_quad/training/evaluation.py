@@ -62,11 +62,11 @@ def rounds(episodes: int | None, drones: int) -> int:
 def merit(score: Mapping[str, float], patience: float | None) -> tuple[float, float]:
     """What makes a policy the best of a run: first the episodes solved, then the return.
 
-    With a ``patience`` the run goes back to that policy, so the episodes count to the nearest 2 %: one evaluation that
-    happened to solve all would hold it for good.
+    With a ``patience`` the run goes back to that policy, so the episodes count to the nearest 2 %: otherwise one
+    evaluation that happened to solve all would hold it for good.
     """
     solved = score["solved"]
-    return solved if patience is None or math.isinf(solved) else round(50 * solved), score["return"]
+    return solved if patience is None or math.isinf(solved) else round(50 * solved) / 50, score["return"]
 
 
 def last_rise(rows: Sequence[Mapping[str, float]]) -> int:

@@ -189,7 +189,7 @@ IDLE: list[tuple[str, Callable[[Any], bool], str]] = [
 
 
 def settings(name: str) -> dict[str, Any]:
-    """What the YAML files of a recipe set, without those for a task; of a recipe that is unknown here, of all."""
+    """What the YAML files of a recipe set, without what is tuned for a task; of an unknown recipe, of all."""
     config, own = OWN.get(name, (name, {}))
     if config not in {*LOSSES, *PROGRAMS.values()}:
         return plain(OmegaConf.merge(*map(settings, LOSSES)))
@@ -232,8 +232,8 @@ def schema_of(values: dict[str, Any], asked: Mapping[str, str] = MappingProxyTyp
     kinds: dict[str, tuple[Any, str]] = {"env": (_environment(values), ""), "loss": (dict[str, Any], "")}
     if config in LOSSES:
         kinds["loss"] = _loss(LOSSES[config], own.get("loss") or {}, values.get("loss"), asked), ""
-    # What is tuned for another recipe, which this one starts from, is left alone. A recipe that is somebody's
-    # own, in another program, may lack anything.
+    # What is tuned for another recipe, which this one starts from, is left alone. A recipe that is somebody's own, in
+    # another program, may lack anything.
     spare = {name for name in SETTINGS if name.startswith("critic.") and name not in asked}
     return _section(settings(values["algorithm"]), SETTINGS | kinds, spare, config in LOSSES)
 
@@ -307,9 +307,10 @@ def _check_together(values: dict[str, Any], asked: Mapping[str, str]) -> None:
                 f"{name}.final_lr=0: it must be above 0 with schedule=exponential, which never reaches 0. Try 1e-6."
             )
     if (name := asked.get("tuned", "null")) not in ("null", *tuned()):
-        close = difflib.get_close_matches(name, tuned(), 1) or tuned()
+        own = [x for x in tuned() if x.startswith(f"{values['algorithm']}_")] or list(tuned())
+        close = difflib.get_close_matches(name, own, 1) or own
         raise UserValueError(
-            f"tuned={name}: no file in {CONFIG / 'tuned'} has such a section. Choose from: {', '.join(close)}."
+            f"tuned={name}: nothing has this name in {CONFIG / 'by_task'}. Choose from: {', '.join(close)}."
         )
     for names, is_idle, why in IDLE:
         for name in set(names.split()) & asked.keys():

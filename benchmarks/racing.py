@@ -28,7 +28,7 @@ from torchrl_quad.training.evaluation import load_policy
 PAGE = Path(__file__).parents[1] / "docs/racing.md"
 TRACKS = ["visfly", "time_optimal", "split_s", "alpha_pilot", "airsim", "lsy_level0", "random"]
 DRONES = {"lsy_level0": "crazyflie_brushless"}  # where others are as wide as the gates
-LEAST = {"lsy_level0": 64}  # AHAC's shortest horizon: frames make gradients stiff, and with 16 steps drones stop
+LEAST = {"lsy_level0": 64}  # the shortest horizon: frames make gradients stiff, and with 16 steps drones stop
 KEY = ("track", "drone", "recipe", "steps", "seed")
 STARTS = 2_000_000  # the seed of the starts, as in recipes/evaluate.py
 DRAWN = 8  # random tracks whose bounds are found, each of which takes seconds
@@ -88,15 +88,14 @@ def table(rows: list[dict[str, str]]) -> str:
 
 
 def main() -> None:
-    options = {"tracks": TRACKS, "seeds": [0], "drone": "kingfisher", "recipe": "ahac", "steps": 3_072_000}
-    more = {"episodes": 256, "cores": os.cpu_count() or 1, "runs": "outputs/ladder"}
-    more["overrides"] = ["tuned=ahac_racing_tracks"]
+    options = {"tracks": TRACKS, "seeds": [0], "drone": "kingfisher", "recipe": "train", "steps": 8_000_000}
+    more = {"episodes": 256, "cores": os.cpu_count() or 1, "runs": "outputs/ladder", "overrides": [""]}
     args = command_line(__doc__, "racing.csv", **options, **more)
 
     def fly(track: str, seed: int) -> None:
         own = dict(zip(KEY, (track, *own_of(track), seed), strict=True))
         folder = Path(args.runs, *map(str, own.values()))
-        least = [f"loss.min_horizon={LEAST[track]}"] if args.recipe == "ahac" and track in LEAST else []
+        least = [f"loss.min_horizon={LEAST[track]}"] if track in LEAST else []
         train(folder, **own, overrides=[*least, *(x for x in args.overrides if x)])
         seconds = read_rows(folder / "metrics.csv")[-1]["time/processor_seconds"]
         about = {"seconds": f"{float(seconds):.0f}", "machine": machine(), "torch": torch.__version__, "threads": 1}

@@ -39,7 +39,6 @@ VARIANTS = {  # of a task: its overrides
     "racing_position": ["task=racing", "env.reward=position"],
     "six_gates": ["task=racing", "env.track=six_gates"],
     "six_gates_back": ["task=racing", f"env.track={{gates: {load_track('six_gates')['gates'][::-1]}}}"],
-    "random_tracks": ["task=racing", "env.track=random", "env.observe_directions=true", "env.drone=kingfisher"],
     "point_mass": ["task=hovering", "env.dynamics=point_mass"],
     "memory": ["task=tracking", "actor.recurrent=true"],
     **{mode: ["task=hovering", f"env.control={mode}"] for mode in ("attitude", "rotor_thrusts", "velocity")},

@@ -27,7 +27,7 @@ Table = list[dict[str, str]]
 RELIABLE = 0.99  # of the episodes, solved by the worst seed
 ENOUGH, WANTED = 3, 10  # seeds: for an interval, and of each method
 LABELS = {"racing_position": "racing, position", "six_gates": "six gates", "six_gates_back": "six gates, backwards"}
-LABELS |= {"random_tracks": "random tracks", "point_mass": "hovering, a point mass", "memory": "tracking with a memory"}
+LABELS |= {"point_mass": "hovering, a point mass", "memory": "tracking with a memory"}
 LABELS |= {x: f"hovering by {x.replace('_', ' ')}" for x in ("attitude", "rotor_thrusts", "velocity")}
 
 

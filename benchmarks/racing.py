@@ -95,7 +95,8 @@ def main() -> None:
     def fly(track: str, seed: int) -> None:
         own = dict(zip(KEY, (track, *own_of(track), seed), strict=True))
         folder = Path(args.runs, *map(str, own.values()))
-        least = [f"loss.min_horizon={LEAST[track]}"] if track in LEAST else []
+        adapts = args.recipe in ("ahac", "train")  # its horizon
+        least = [f"loss.min_horizon={LEAST[track]}"] if adapts and track in LEAST else []
         train(folder, **own, overrides=[*least, *(x for x in args.overrides if x)])
         seconds = read_rows(folder / "metrics.csv")[-1]["time/processor_seconds"]
         about = {"seconds": f"{float(seconds):.0f}", "machine": machine(), "torch": torch.__version__, "threads": 1}

@@ -356,10 +356,9 @@ def test_a_policy_whose_memory_amplifies_rounding_errors_is_exported(tmp_path, t
     trace_once("hovering")
     env, _ = build("hovering, with memory")
     actor = make_actor(env, (16, 16), recurrent=True, hidden_size=32)
-    with torch.no_grad():
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         actor.last.mlp[-1].weight.add_(0.3 * torch.randn_like(actor.last.mlp[-1].weight))
         next(x for name, x in actor.named_parameters() if "weight_hh" in name).mul_(20.0)
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         flight, _ = differentiable_rollout(env, actor, None, 48)
         flown, seen = (flight.select(*actor.in_keys).clone() for _ in range(2))
         seen["observation"][:, 0] += 1e-6

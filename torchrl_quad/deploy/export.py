@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -200,20 +199,15 @@ def _fly(env: QuadrotorEnv, policy: TensorDictModuleBase, count: int) -> tuple[T
 
 
 @torch.no_grad()
-def _act(policy: TensorDictModuleBase, env: QuadrotorEnv, seen: Mapping[NestedKey, Tensor]) -> TensorDictBase:
-    """What the policy does in single steps (n), as it is and not folded, with what it reads, its memory too."""
-    shape = seen["observation"].shape[:-1]
-    given = TensorDict({key: x.to(env.device, env.dtype) for key, x in seen.items()}, shape, env.device)
-    if "is_init" in policy.in_keys:
-        given["is_init"] = torch.zeros((*shape, 1), dtype=torch.bool, device=env.device)
-    with set_exploration_type(ExplorationType.DETERMINISTIC), set_recurrent_mode(False):
-        return policy(given)
-
-
 def _vectors(policy: TensorDictModuleBase, env: QuadrotorEnv, chosen: TensorDictBase) -> dict[str, np.ndarray]:
-    """What the policy reads and writes in single steps, float32, by the names that its ONNX has for it."""
+    """What the policy, as it is and not folded, reads and writes in single steps (n), its memory too: float32, by the
+    names that its ONNX has for it."""
     seen = {key: leaf(chosen, key).float() for key in policy.in_keys if key != "is_init"}
-    acted, memory = _act(policy, env, seen), memory_keys(policy)
+    given = TensorDict({key: x.to(env.device, env.dtype) for key, x in seen.items()}, chosen.shape, env.device)
+    if "is_init" in policy.in_keys:
+        given["is_init"] = torch.zeros((*chosen.shape, 1), dtype=torch.bool, device=env.device)
+    with set_exploration_type(ExplorationType.DETERMINISTIC), set_recurrent_mode(False):
+        acted, memory = policy(given), memory_keys(policy)
     vectors = {name: seen[name] for name in ("observation", "depth") if name in seen}
     vectors |= {"memory": seen[memory[0]].flatten(1)} if memory else {}
     vectors |= {"action": leaf(acted, "action")}
@@ -258,14 +252,12 @@ def _check_the_flight(
                 f"{step}. observe and advance {how}"
             )
         # Step by step from the bundle's own memory: over an episode a policy may amplify rounding errors without bound.
-        read = {key: leaf(episode, key) for key in policy.in_keys if key != "is_init"}
+        read = episode.select(*(key for key in policy.in_keys if key != "is_init"))
         read["observation"] = torch.from_numpy(observation)
         for key in memory_keys(policy):
             read[key] = torch.from_numpy(np.stack(memories[:-1])).reshape(read[key].shape)
-        acted = _act(policy, env, read)
-        written = [leaf(acted, _below("next", cast(Key, key))).flatten(1) for key in memory_keys(policy)]
-        pairs = zip([actions, memories[1:]], [leaf(acted, "action"), *written], strict=False)
-        gap = max(np.abs(np.stack(found) - _array(x.float())).max() for found, x in pairs)
+        own, found = _vectors(policy, env, read), {"action": actions, "next_memory": memories[1:]}
+        gap = max(np.abs(np.stack(x) - own[name]).max() for name, x in found.items() if name in own)
         if not gap <= TOLERANCE:
             raise UserValueError(f"export_policy: the bundle acts differently from the policy, by {gap:.3g}.")
     if rules.unjudged:

@@ -183,7 +183,7 @@ def main() -> None:
         checks.append(({"check": "waits for the device", **own}, early, waits, (device, args.check_envs)))
     checks.append(({"check": "checkpoint to CPU"}, early, checkpoint, (device,)))
     limit = early - start - 10  # its process has to start, and to end
-    checks.append(({"check": "hovering solved"}, early, learned, (device, "shac", "hovering", limit, overrides)))
+    checks.append(({"check": "hovering solved"}, early, learned, (device, "train", "hovering", limit, overrides)))
     rows: list[Row] = []
     where = torch.cuda.get_device_name() if device != "cpu" else "cpu"
     with tempfile.TemporaryDirectory() as folder:

@@ -88,7 +88,7 @@ def table(rows: list[dict[str, str]]) -> str:
 
 
 def main() -> None:
-    options = {"tracks": TRACKS, "seeds": [0], "drone": "kingfisher", "recipe": "train", "steps": 8_000_000}
+    options = {"tracks": TRACKS, "seeds": [0], "drone": "kingfisher", "recipe": "train", "steps": 6_000_000}
     more = {"episodes": 256, "cores": os.cpu_count() or 1, "runs": "outputs/ladder", "overrides": [""]}
     args = command_line(__doc__, "racing.csv", **options, **more)
 

@@ -27,7 +27,14 @@ from torchrl_quad.training.building import (
     minibatches,
     shuffled,
 )
-from torchrl_quad.training.evaluation import has_levelled_off, has_lost_its_way, last_rise, looks_ahead, merit, stalls
+from torchrl_quad.training.evaluation import (
+    has_levelled_off,
+    has_lost_its_way,
+    last_rise,
+    looks_ahead,
+    merit,
+    next_pace,
+)
 from torchrl_quad.training.loop import Run, backward
 
 
@@ -86,9 +93,12 @@ def test_a_schedule_goes_from_the_first_to_the_last_learning_rate(schedule, half
 def test_the_inverse_square_root_of_the_iteration_is_the_same_rate_in_runs_of_every_length():
     for length in (901, 5000):
         adam = optimizer(length, schedule="inverse_sqrt")
-        for iteration, rate in ((0, 1e-2), (150, 1e-2), (600, 5e-3), (900, 1e-2 / 6**0.5)):
+        for iteration, rate in ((0, 1e-2), (150, 1e-2), (600, 5e-3), (700, 1e-2 * (15 / 70) ** 0.5)):
             adam.anneal(iteration)
             assert adam.param_groups[0]["lr"] == pytest.approx(rate)
+    for iteration, share in ((3999, 1.0), (4499, 0.5), (4999, 0.0)):  # and of a run that comes to its last fifth
+        adam.anneal(iteration, pace=0.25)
+        assert adam.param_groups[0]["lr"] == pytest.approx(share * 0.25e-2 * (150 / iteration) ** 0.5, rel=2e-3)
 
 
 @pytest.mark.parametrize("unit", [1.0, 1000.0])
@@ -159,13 +169,14 @@ def test_the_best_policy_solves_most_and_with_a_patience_to_the_nearest_2_percen
     assert max([first, early, late, none], key=lambda score: merit(score, 0.5)) == late
 
 
-def test_a_run_stalls_when_no_evaluation_has_risen_for_two_thirds_of_its_patience_and_once_each_time():
+def test_the_rate_quarters_where_nothing_has_risen_for_two_thirds_of_the_patience_and_doubles_with_each_rise():
     curve = [{"steps": 10 * i, "eval/return": min(i, 20.0), "eval/solved": 0.5} for i in range(1, 62)]
-    assert next(n for n in range(1, 62) if stalls(curve[:n], 0, 0.8)) == 43
-    assert next(n for n in range(1, 62) if stalls(curve[:n], 250, 0.8)) == 54
-    assert not stalls(curve, 0, None) and not stalls([row | {"eval/solved": 0.4} for row in curve], 0, 0.5)
+    assert [next_pace(curve[:n], 0, 0.8) for n in range(1, 44)] == [*[2.0] * 20, *[1.0] * 22, 0.25]
+    assert next(n for n in range(21, 62) if next_pace(curve[:n], 250, 0.8) == 0.25) == 54
+    assert next_pace(curve[:5], 0, None) == next_pace(curve, 0, None) == 1.0
+    assert next_pace([row | {"eval/solved": 0.4} for row in curve], 0, 0.5) == 1.0
     rare = [row | {"steps": 100 * row["steps"], "eval/return": 1.0} for row in curve[1:]]
-    assert next(n for n in range(1, 60) if stalls(curve[:1] + rare[:n], 0, 0.5)) == 10  # evaluations at least
+    assert [next_pace(curve[:1] + rare[:n], 0, 0.5) for n in range(1, 11)] == [*[1.0] * 9, 0.25]  # ten at least
 
 
 def test_when_a_run_evaluates_follows_from_what_every_process_knows():

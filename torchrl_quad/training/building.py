@@ -162,7 +162,8 @@ def parameter_groups(name: str, module: nn.Module) -> list[dict[str, Any]]:
 class Optimizer(torch.optim.Adam):
     """Adam, a schedule that takes its learning rate from ``lr`` to ``final_lr`` over the run, and a bound on gradients.
 
-    The schedule ``inverse_sqrt`` is for runs of any length: constant, and from iteration 150 on one over its root.
+    The schedule ``inverse_sqrt`` is for runs of any length: constant, and from iteration 150 on one over its root. Only
+    a run that comes to its last fifth lets it fall to zero.
     ``name`` is the section of the network, "actor" or "critic"; ``module`` is that network, or the loss that holds it.
     """
 
@@ -176,16 +177,18 @@ class Optimizer(torch.optim.Adam):
             "linear": lambda share: 1.0 + share * (decay - 1.0),
             "exponential": lambda share: decay**share,
             "cosine": lambda share: decay + (1.0 - decay) * 0.5 * (1.0 + math.cos(math.pi * share)),
-            "inverse_sqrt": lambda share: max(share * (self.iterations - 1) / 150, 1.0) ** -0.5,
+            "inverse_sqrt": lambda share: (
+                max(share * (self.iterations - 1) / 150, 1.0) ** -0.5 * min(5.0 * (1.0 - share), 1.0)
+            ),
         }
         self.factor = factors[section.schedule]
 
-    def anneal(self, iteration: float) -> None:
-        """Set the learning rate of an iteration, counted from 0, which may lie between two of them."""
+    def anneal(self, iteration: float, pace: float = 1.0) -> None:
+        """Set the learning rate of an iteration, counted from 0, which may lie between two; ``pace`` multiplies it."""
         # A function of the finished share of the run, so that a run can be resumed and made longer.
         share = min(iteration / max(self.iterations - 1, 1), 1.0)
         for group in self.param_groups:
-            group["lr"] = self.first_lr * self.factor(share) * group.get("share", 1.0)
+            group["lr"] = self.first_lr * self.factor(share) * pace
 
 
 class AdaptiveOptimizer(Optimizer):
@@ -201,10 +204,9 @@ class AdaptiveOptimizer(Optimizer):
             raise UserValueError(f"{name}.max_kl=null: this recipe sets its rate by it. Write a number; 0.25 is usual.")
         self.max_kl = cfg[name].max_kl
 
-    def anneal(self, iteration: float) -> None:
-        """Set the limit of an iteration, counted from 0."""
-        share = self.param_groups[0].get("share", 1.0)
-        self.limit = 1.5 * self.max_kl * max(1.0 - iteration / self.iterations, 0.02) * share
+    def anneal(self, iteration: float, pace: float = 1.0) -> None:
+        """Set the limit of an iteration, counted from 0; ``pace`` multiplies it."""
+        self.limit = 1.5 * self.max_kl * max(1.0 - iteration / self.iterations, 0.02) * pace
 
     def adapt(self, moved: float) -> None:
         """Adapt the learning rate to how far the horizon has moved the policy."""

@@ -85,7 +85,7 @@ def last_rise(rows: Sequence[Mapping[str, float]]) -> int:
 
 
 def has_levelled_off(
-    rows: Sequence[Mapping[str, float]], patience: float | None, solved: float = 0.5, least: int = 30
+    rows: Sequence[Mapping[str, float]], patience: float | None, solved: float = 0.5, least: int = 15
 ) -> bool:
     """Whether no evaluation of a run has risen for a share ``patience`` of it; never where that is None.
 
@@ -114,17 +114,17 @@ def has_lost_its_way(rows: Sequence[Mapping[str, float]], patience: float | None
     return not rows[-1]["eval/return"] >= max(returns) - 0.1 * (max(returns) - min(returns))
 
 
-def stalls(rows: Sequence[Mapping[str, float]], since: int, patience: float | None, least: int = 10) -> bool:
-    """Whether a run that once solved half of an evaluation's episodes needs a lower rate.
+def next_pace(rows: Sequence[Mapping[str, float]], since: int, patience: float | None, least: int = 10) -> float:
+    """By what the actor's rate changes after a run's last evaluation: a quarter where it stalls, 2 where it rises.
 
-    No evaluation has risen for two thirds of the patience, and at least ``least`` of them have passed since the last
-    rise and since the step ``since``.
+    A run stalls that once solved half of an evaluation's episodes, where no evaluation has risen for two thirds of the
+    patience, and at least ``least`` of them have passed since the last rise and since the step ``since``.
     """
-    if patience is None or max(row["eval/solved"] for row in rows) < 0.5:
-        return False
-    since = max(since, last_rise(rows))
-    waited = sum(row["steps"] > since for row in rows) >= least
-    return waited and since <= (1.0 - patience * 2 / 3) * rows[-1]["steps"]
+    if patience is None or (rose := last_rise(rows)) == rows[-1]["steps"]:
+        return 1.0 if patience is None else 2.0
+    since = max(since, rose)
+    waited = sum(row["steps"] > since for row in rows) >= least and max(row["eval/solved"] for row in rows) >= 0.5
+    return 0.25 if waited and since <= (1.0 - patience * 2 / 3) * rows[-1]["steps"] else 1.0
 
 
 def looks_ahead(rows: Sequence[Mapping[str, float]], patience: float | None) -> bool:
@@ -132,7 +132,8 @@ def looks_ahead(rows: Sequence[Mapping[str, float]], patience: float | None) -> 
 
     That is for half of its patience, and after 30 evaluations at the earliest.
     """
-    level = (has_levelled_off(rows[:n], patience and patience / 2, solved=0.0) for n in range(len(rows) + 1))
+    half = patience and patience / 2
+    level = (has_levelled_off(rows[:n], half, solved=0.0, least=30) for n in range(len(rows) + 1))
     return any(row["eval/solved"] >= 0.9 for row in rows) or any(level)
 
 

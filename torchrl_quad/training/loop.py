@@ -59,16 +59,16 @@ from torchrl_quad.training.evaluation import (
     last_rise,
     looks_ahead,
     merit,
+    next_pace,
     print_summary,
     rounds,
-    stalls,
     title,
     write_summary,
 )
 from torchrl_quad.training.logs import Logs
 
 # Of a checkpoint.
-PROGRESS = ("iteration", "steps", "skipped", "seconds", "processor_seconds", "rows", "best", "slower_since")
+PROGRESS = ("iteration", "steps", "skipped", "seconds", "processor_seconds", "rows", "best", "pace", "slower_since")
 CELL = 0.5  # [m]: train/start_cells counts the cubes of this size in which horizons have started
 
 
@@ -79,7 +79,8 @@ class Run:
     to continue bit for bit, and the best policy so far: the one that solved most episodes in an evaluation, and of
     those the one with the greatest return. At the end that policy flies from other starts. With ``eval.patience``,
     episodes solved count to the nearest 2 %, and a run that has lost its way goes back to its best policy, with its
-    critics and optimisers; so does a run that has stalled, at a quarter of the actor's rate.
+    critics and optimisers; so does a run that has stalled, at a quarter of the actor's rate, which doubles with each
+    evaluation that rises again.
 
     The seconds are those of the loop, without set-up, compilation, evaluations and checkpoints.
 
@@ -119,6 +120,7 @@ class Run:
         self.starts: list[Tensor] = []  # positions in which the horizons since the last row have started
         self.rows: list[dict[str, float]] = []  # of metrics.csv
         self.iteration, self.seconds, self.processor_seconds, self.skipped, self.slower_since = 0, 0.0, 0.0, 0, 0
+        self.pace = 1.0  # the share of its schedule's rate that the actor learns with
         self.best: dict[str, Any] = {"solved": -math.inf, "return": -math.inf}
         self.folder = Path(HydraConfig.get().runtime.output_dir)
         self.saved: Path | None = None  # the last checkpoint known to be intact
@@ -170,7 +172,8 @@ class Run:
             while self.goes_on:
                 self.starts.append(self.carry["state", "position"].clone())
                 for optimizer in (x for x in self.stateful if isinstance(x, Optimizer)):
-                    optimizer.anneal(self.steps / self.drones / self.cfg.horizon)
+                    pace = self.pace if optimizer.name == "actor" else 1.0
+                    optimizer.anneal(self.steps / self.drones / self.cfg.horizon, pace)
                 start, processor_start = time.perf_counter(), time.process_time()
                 yield self.iteration
                 if self.average is not None:
@@ -181,20 +184,23 @@ class Run:
                 self.steps += self.horizon * self.drones
                 bar.update(self.horizon * self.drones)
                 if self.is_due or self.steps >= self.total_steps:
-                    best, slower, self.evaluated = None, False, self.iteration
+                    best, pace, self.evaluated = None, 1.0, self.iteration
                     if rank() == 0:
                         metrics = self._evaluate()
                         solved = metrics["eval/solved"]
                         bar.set_postfix_str(f"return {metrics['eval/return']:.2f}, solved {solved:.0%}")
                         self.looks_ahead = looks_ahead(self.rows, self.cfg.eval.patience)
                         self.levelled_off = has_levelled_off(self.rows, self.cfg.eval.patience)
-                        slower = stalls(self.rows, self.slower_since, self.cfg.eval.patience)
-                        if slower or has_lost_its_way(self.rows, self.cfg.eval.patience):
+                        pace = next_pace(self.rows, self.slower_since, self.cfg.eval.patience)
+                        if pace < 1.0 or has_lost_its_way(self.rows, self.cfg.eval.patience):
                             best = self.best.get("stateful")
-                    known = self.looks_ahead, self.levelled_off, best, slower
-                    self.looks_ahead, self.levelled_off, best, slower = of_first(known)
+                    known = self.looks_ahead, self.levelled_off, best, pace
+                    self.looks_ahead, self.levelled_off, best, pace = of_first(known)
+                    self.pace = min(max(pace * self.pace, 1 / 16), 1.0)
+                    if pace < 1.0:
+                        self.slower_since = self.steps
                     if best is not None:
-                        self._roll_back(best, slower)
+                        self._roll_back(best)
                     self.recorded.clear()
                     self.starts.clear()
                     self._save(self.folder / "checkpoint.pt")
@@ -302,16 +308,9 @@ class Run:
                 self.best["stateful"] = copy.deepcopy([x.state_dict() for x in self.stateful])
         return metrics
 
-    def _roll_back(self, stateful: list[dict[str, Any]], slower: bool) -> None:
-        """Go back to the best policy with its critics and optimisers, from fresh starts.
-
-        ``slower`` takes a quarter of its rate, but no less than a sixteenth of the first.
-        """
+    def _roll_back(self, stateful: list[dict[str, Any]]) -> None:
+        """Go back to the best policy with its critics and optimisers, from fresh starts."""
         for x, state in zip(self.stateful, stateful, strict=True):
-            if slower and isinstance(x, Optimizer) and x.name == "actor":
-                self.slower_since = self.steps
-                for group in state["param_groups"]:
-                    group["share"] = max(group.get("share", 1.0) / 4, 1 / 16)
             x.load_state_dict(copy.deepcopy(state))
         # The weights of which the best policy was the mean may be poor.
         self.actor.load_state_dict(self.flown.state_dict())

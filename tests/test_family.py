@@ -161,6 +161,10 @@ def test_one_step_towards_better_actions_goes_where_the_loss_itself_goes(env64):
     refuses("leaves out its entropy bonus: set alpha to 0", bonus.better_actions, rollout, error=NotImplementedError)
     refuses("loss_fit reads 'action_target', which is not", ahac.loss_fit, rollout)
     towards = ahac.loss_fit(rollout.detach().set("action_target", target))
+    masked = rollout.detach().set("action_target", target.clone()).set(("collector", "mask"), torch.ones(4, 5).bool())
+    masked["collector", "mask"][:, 3], masked["action_target"][:, 3] = False, torch.nan
+    grads = torch.autograd.grad(ahac.loss_fit(masked), list(actor.parameters()), allow_unused=True)
+    assert all(x.isfinite().all() for x in grads if x is not None)
     for pair in ((pods.loss_actor(by_pods)[0], bptt.loss_actor(rollout)[0]), (towards, ahac.loss_actor(rollout)[0])):
         grads = (torch.autograd.grad(loss, list(actor.parameters()), allow_unused=True) for loss in pair)
         flat = [torch.cat([x.flatten() for x in grad if x is not None]) for grad in grads]

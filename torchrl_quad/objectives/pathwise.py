@@ -314,6 +314,8 @@ class PathwiseLoss(LossModule):
             )
         target, counts = leaf(tensordict, key), self._counts(tensordict)
         action = act_again(self.actor_network, self.actor_network_params, tensordict)[self.tensor_keys.action]
+        if counts is not None:  # a step that does not may hold anything
+            target = torch.where(counts, target, action.detach())
         distance = 0.5 * (action - target).square().sum(-1)
         return self._reduce_loss(mean_over_steps(distance, counts))
 

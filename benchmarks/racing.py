@@ -28,7 +28,6 @@ from torchrl_quad.training.evaluation import load_policy
 PAGE = Path(__file__).parents[1] / "docs/racing.md"
 TRACKS = ["visfly", "time_optimal", "split_s", "alpha_pilot", "airsim", "lsy_level0", "random"]
 DRONES = {"lsy_level0": "crazyflie_brushless"}  # where others are as wide as the gates
-LEAST = {"lsy_level0": 64}  # the shortest horizon: frames make gradients stiff, and with 16 steps drones stop
 KEY = ("track", "drone", "recipe", "steps", "seed")
 STARTS = 2_000_000  # the seed of the starts, as in recipes/evaluate.py
 DRAWN = 8  # random tracks whose bounds are found, each of which takes seconds
@@ -95,9 +94,7 @@ def main() -> None:
     def fly(track: str, seed: int) -> None:
         own = dict(zip(KEY, (track, *own_of(track), seed), strict=True))
         folder = Path(args.runs, *map(str, own.values()))
-        adapts = args.recipe in ("ahac", "train")  # its horizon
-        least = [f"loss.min_horizon={LEAST[track]}"] if adapts and track in LEAST else []
-        train(folder, **own, overrides=[*least, *(x for x in args.overrides if x)])
+        train(folder, **own, overrides=[x for x in args.overrides if x])
         seconds = read_rows(folder / "metrics.csv")[-1]["time/processor_seconds"]
         about = {"seconds": f"{float(seconds):.0f}", "machine": machine(), "torch": torch.__version__, "threads": 1}
         about["revision"] = revision()

@@ -389,7 +389,7 @@ class Run:
             if own["cuda"] is not None:
                 torch.cuda.set_rng_state(own["cuda"], self.env.device)
             for name in PROGRESS:
-                setattr(self, name, saved.get(name, getattr(self, name)))  # older ones lack the last
+                setattr(self, name, saved.get(name, getattr(self, name)))  # older ones lack the last two
             self.best |= {name: float(self.best[name]) for name in ("solved", "return")}
             self.rows = [{str(name): value + 0 for name, value in row.items()} for row in self.rows]
         self.saved, before = path, saved["revision"]

@@ -31,6 +31,7 @@ from torchrl_quad.training.evaluation import (
     has_levelled_off,
     has_lost_its_way,
     last_rise,
+    looks_ahead,
     merit,
     next_pace,
 )
@@ -131,6 +132,12 @@ def test_a_run_levels_off_when_no_evaluation_has_risen_for_a_share_of_it():
     assert level == [False, False, True, True]
     assert not has_levelled_off(curve, 0.5)  # too few evaluations to say
     assert not has_levelled_off([row | {"eval/solved": 0.4} for row in curve], 0.5, least=10)  # the task is not solved
+    low = [row | {"eval/solved": 0.4} for row in curve]
+    later = [row | {"steps": 110.0} for row in low[-1:]] * 20
+    assert [looks_ahead(rows, 1.0) for rows in ([], curve[:1], low, low + later)] == [False, False, False, True]
+    assert looks_ahead([curve[0] | {"eval/solved": 0.9}, *low], 1.0)
+    assert looks_ahead([*low, *later, {"steps": 111.0, "eval/return": 200.0, "eval/solved": 0.0}], 1.0)  # it stays so
+    assert not looks_ahead(low + later, None)
     curve[7]["eval/solved"] = 0.52
     assert last_rise(curve) == 80 and last_rise([*curve, curve[-1] | {"eval/return": float("nan")}]) == 80
     assert (

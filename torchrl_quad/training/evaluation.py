@@ -84,13 +84,15 @@ def last_rise(rows: Sequence[Mapping[str, float]]) -> int:
     return rose
 
 
-def has_levelled_off(rows: Sequence[Mapping[str, float]], patience: float | None, least: int = 15) -> bool:
+def has_levelled_off(
+    rows: Sequence[Mapping[str, float]], patience: float | None, solved: float = 0.5, least: int = 15
+) -> bool:
     """Whether no evaluation of a run has risen for a share ``patience`` of it; never where that is None.
 
-    A run of fewer than ``least`` evaluations goes on, and so does one that has not solved half of an evaluation's
-    episodes, since returns stay level for long before the first are solved.
+    A run of fewer than ``least`` evaluations goes on, and so does one that has not solved a share ``solved`` of an
+    evaluation's episodes, since returns stay level for long before the first are solved.
     """
-    if patience is None or len(rows) < least or max(row["eval/solved"] for row in rows) < 0.5:
+    if patience is None or len(rows) < least or max(row["eval/solved"] for row in rows) < solved:
         return False
     return last_rise(rows) <= (1.0 - patience) * rows[-1]["steps"]
 
@@ -123,6 +125,16 @@ def next_pace(rows: Sequence[Mapping[str, float]], since: int, patience: float |
     since = max(since, rose)
     waited = sum(row["steps"] > since for row in rows) >= least and max(row["eval/solved"] for row in rows) >= 0.5
     return 0.25 if waited and since <= (1.0 - patience * 2 / 3) * rows[-1]["steps"] else 1.0
+
+
+def looks_ahead(rows: Sequence[Mapping[str, float]], patience: float | None) -> bool:
+    """Whether a run has solved nine tenths of an evaluation's episodes, or has once levelled off without.
+
+    That is for half of its patience, and after 30 evaluations at the earliest.
+    """
+    half = patience and patience / 2
+    level = (has_levelled_off(rows[:n], half, solved=0.0, least=30) for n in range(len(rows) + 1))
+    return any(row["eval/solved"] >= 0.9 for row in rows) or any(level)
 
 
 @contextlib.contextmanager

@@ -57,6 +57,7 @@ from torchrl_quad.training.evaluation import (
     has_levelled_off,
     has_lost_its_way,
     last_rise,
+    looks_ahead,
     merit,
     next_pace,
     print_summary,
@@ -93,6 +94,7 @@ class Run:
         carry: where the next horizon starts; the algorithm sets it in each iteration.
         horizon: control steps of this iteration's rollout, ``cfg.horizon`` unless the algorithm sets it.
         levelled_off: whether its evaluations have, by ``eval.patience``; then it ends.
+        looks_ahead: whether nine tenths of an evaluation have once been solved, or it has levelled off.
     """
 
     def __init__(
@@ -129,6 +131,7 @@ class Run:
         if not cfg.resume:
             self.carry = env.reset()
         self.evaluated = self.rows[-1]["iteration"] if self.rows else 0  # known to all processes, as rows are not
+        self.looks_ahead = looks_ahead(self.rows, cfg.eval.patience)
         self.levelled_off = has_levelled_off(self.rows, cfg.eval.patience)
         self.is_over = not self.goes_on and (self.folder / "summary.json").exists()
         if rank() == 0 and not self.is_over:
@@ -186,11 +189,13 @@ class Run:
                         metrics = self._evaluate()
                         solved = metrics["eval/solved"]
                         bar.set_postfix_str(f"return {metrics['eval/return']:.2f}, solved {solved:.0%}")
+                        self.looks_ahead = looks_ahead(self.rows, self.cfg.eval.patience)
                         self.levelled_off = has_levelled_off(self.rows, self.cfg.eval.patience)
                         pace = next_pace(self.rows, self.slower_since, self.cfg.eval.patience)
                         if pace < 1.0 or has_lost_its_way(self.rows, self.cfg.eval.patience):
                             best = self.best.get("stateful")
-                    self.levelled_off, best, pace = of_first((self.levelled_off, best, pace))
+                    known = self.looks_ahead, self.levelled_off, best, pace
+                    self.looks_ahead, self.levelled_off, best, pace = of_first(known)
                     self.pace = min(max(pace * self.pace, 1 / 16), 1.0)
                     if pace < 1.0:
                         self.slower_since = self.steps

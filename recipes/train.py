@@ -39,15 +39,16 @@ def main(cfg: DictConfig) -> None:
             if not run.optimise(actor_optimizer, loss_actor):
                 break
 
-        # The critics: towards TD(lambda) targets, from the least of them.
+        # The critics: towards TD(lambda) targets, from the least of them; the more steps, the slower the actor learns.
         data = loss.write_value_target(data)
         scale.update(data)
-        critic_metrics = run.fit_critic(critic_optimizer, data)
+        rate = actor_optimizer.param_groups[0]["lr"]
+        share = max(rate / (run.pace * actor_optimizer.first_lr), 1 / 3)
+        critic_metrics = run.fit_critic(critic_optimizer, data, times=1 / share)
 
         update_normalizer(env, rollout)
         run.carry = restart(env, end, cfg.restart_fraction)
         loss.adapt_horizon(mean_of_all(metrics["stiffness"]))
-        rate = actor_optimizer.param_groups[0]["lr"]
         run.record(horizon=run.horizon, rate=rate, scale=scale.value, loss_actor=loss_actor)
         run.record(**metrics, **critic_metrics)
 

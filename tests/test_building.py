@@ -220,6 +220,7 @@ def test_minibatches_are_random_steps_or_each_once_in_an_epoch_and_horizons_of_a
     cfg = OmegaConf.create({"updates": 3, "batch_size": 50})
     batches = [batch["step"] for batch in minibatches(numbered(3, 4), cfg)]
     assert [batch.shape for batch in batches] == [(50,)] * 3
+    assert len(list(minibatches(numbered(3, 4), cfg, 2.5))) == 8  # times as many
     assert set(torch.cat(batches).tolist()) == set(range(12)) and not torch.equal(batches[0], batches[1])
     batches = [batch["step"] for batch in shuffled(numbered(3, 4), 5, 2)]
     assert [len(batch) for batch in batches] == [5, 5, 2, 5, 5, 2]

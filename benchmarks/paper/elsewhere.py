@@ -301,7 +301,8 @@ def train_one_setting(environment: str, seed: int) -> tuple[float, float, float]
         average.update_parameters(actor)
         data = loss.write_value_target(data)
         scale.update(data)
-        for batch in minibatches(data, cfg.critic):
+        share = max(actor_optimizer.param_groups[0]["lr"] / actor_optimizer.first_lr, 1 / 3)
+        for batch in minibatches(data, cfg.critic, 1 / share):
             optimise(critic_optimizer, loss.loss_value(batch)[0], cfg.critic.max_grad_norm)
         loss.adapt_horizon(metrics["stiffness"])
         return rollout, carry

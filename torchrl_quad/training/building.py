@@ -289,10 +289,10 @@ def update_normalizer(env: EnvBase, rollout: TensorDictBase) -> None:
         cast("ObservationNormalizer", env.transform).update(TensorDict({("next", "observation"): seen}))
 
 
-def minibatches(rollout: TensorDictBase, cfg: DictConfig) -> Iterator[TensorDictBase]:
-    """``cfg.updates`` random batches of ``cfg.batch_size`` steps from a rollout."""
+def minibatches(rollout: TensorDictBase, cfg: DictConfig, times: float = 1.0) -> Iterator[TensorDictBase]:
+    """``cfg.updates`` random batches of ``cfg.batch_size`` steps from a rollout, or so many ``times``."""
     steps = cast("TensorDict", rollout.reshape(-1))
-    for _ in range(cfg.updates):
+    for _ in range(round(times * cfg.updates)):
         yield cast("TensorDict", steps[torch.randint(len(steps), (cfg.batch_size,), device=steps.device)])
 
 

@@ -239,15 +239,16 @@ class Run:
         )
 
     def fit_critic(
-        self, optimizer: Optimizer, data: TensorDictBase, target: TargetUpdate | None = None
+        self, optimizer: Optimizer, data: TensorDictBase, target: TargetUpdate | None = None, times: float = 1.0
     ) -> dict[str, Any]:
         """Take ``critic.updates`` steps of the critic towards the value targets in ``data``, on random minibatches.
 
-        ``target`` moves the target critic after each. Returns the loss and the metrics of the last minibatch.
+        ``target`` moves the target critic after each, and there are so many ``times`` as many. Returns the loss and the
+        metrics of the last minibatch.
         """
         loss, metrics = cast("PathwiseCriticLoss", self.loss), {}
         read = data.select(*getattr(loss, loss.critic_name).in_keys, loss.tensor_keys.value_target)
-        for batch in minibatches(read, self.cfg.critic):
+        for batch in minibatches(read, self.cfg.critic, times):
             loss_critic, measured = getattr(loss, loss.critic_loss_key)(batch)
             self.optimise(optimizer, loss_critic)
             metrics = {loss.critic_loss_key: loss_critic, **measured}

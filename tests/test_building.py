@@ -126,19 +126,22 @@ def test_rewards_in_any_unit_are_divided_by_the_size_of_returns_and_critics_keep
 
 def test_a_run_levels_off_when_no_evaluation_has_risen_for_a_share_of_it():
     returns = [-10.0, 90.0, 90.9, 91.1, 91.9, *[92.0] * 5]  # a rise is 1 % of the range, 1: at the fourth step
-    curve = [{"steps": 10 * i, "eval/return": x, "eval/solved": 0.5} for i, x in enumerate(returns, 1)]
+    curve = [{"steps": 10 * i, "eval/return": x, "eval/solved": 0.98} for i, x in enumerate(returns, 1)]
     assert [last_rise(curve[:n]) for n in range(1, 11)] == [10, 20, 20, 40, 40, 40, 40, 40, 40, 40]
     level = [has_levelled_off(curve, x, least=10) for x in (None, 0.61, 0.59, 0.5)]
     assert level == [False, False, True, True]
     assert not has_levelled_off(curve, 0.5)  # too few evaluations to say
-    assert not has_levelled_off([row | {"eval/solved": 0.4} for row in curve], 0.5, least=10)  # the task is not solved
+    assert not has_levelled_off([row | {"eval/solved": 0.97} for row in curve], 0.5, least=10)  # the task is not solved
+    wavers = [row | {"eval/return": 89.0 if i == 6 else row["eval/return"]} for i, row in enumerate(curve)]
+    assert has_levelled_off(curve, 0.5, least=20) and not has_levelled_off(wavers, 0.5, least=20)
+    assert has_levelled_off(wavers, 0.5, least=10)
     low = [row | {"eval/solved": 0.4} for row in curve]
     later = [row | {"steps": 110.0} for row in low[-1:]] * 20
-    assert [looks_ahead(rows, 1.0) for rows in ([], curve[:1], low, low + later)] == [False, False, False, True]
+    assert [looks_ahead(rows, 1.0) for rows in ([], low[:1], low, low + later)] == [False, False, False, True]
     assert looks_ahead([curve[0] | {"eval/solved": 0.9}, *low], 1.0)
     assert looks_ahead([*low, *later, {"steps": 111.0, "eval/return": 200.0, "eval/solved": 0.0}], 1.0)  # it stays so
     assert not looks_ahead(low + later, None)
-    curve[7]["eval/solved"] = 0.52
+    curve[7]["eval/solved"] = 1.0
     assert last_rise(curve) == 80 and last_rise([*curve, curve[-1] | {"eval/return": float("nan")}]) == 80
     assert (
         last_rise([*curve, curve[0] | {"eval/return": -math.inf}, {**curve[-1], "steps": 120, "eval/return": 99}])
@@ -170,11 +173,11 @@ def test_the_best_policy_solves_most_and_with_a_patience_to_the_nearest_2_percen
 
 
 def test_the_rate_quarters_where_nothing_has_risen_for_two_thirds_of_the_patience_and_doubles_with_each_rise():
-    curve = [{"steps": 10 * i, "eval/return": min(i, 20.0), "eval/solved": 0.5} for i in range(1, 62)]
+    curve = [{"steps": 10 * i, "eval/return": min(i, 20.0), "eval/solved": 0.98} for i in range(1, 62)]
     assert [next_pace(curve[:n], 0, 0.8) for n in range(1, 44)] == [*[2.0] * 20, *[1.0] * 22, 0.25]
     assert next(n for n in range(21, 62) if next_pace(curve[:n], 250, 0.8) == 0.25) == 54
     assert next_pace(curve[:5], 0, None) == next_pace(curve, 0, None) == 1.0
-    assert next_pace([row | {"eval/solved": 0.4} for row in curve], 0, 0.5) == 1.0
+    assert next_pace([row | {"eval/solved": 0.97} for row in curve], 0, 0.5) == 1.0
     rare = [row | {"steps": 100 * row["steps"], "eval/return": 1.0} for row in curve[1:]]
     assert [next_pace(curve[:1] + rare[:n], 0, 0.5) for n in range(1, 11)] == [*[1.0] * 9, 0.25]  # ten at least
 

@@ -25,6 +25,8 @@ from torchrl_quad.files import replacing
 from torchrl_quad.training.building import build_env, make_policy, task_of
 from torchrl_quad.training.checkpoints import fits, read_checkpoint, saved_config
 
+SOLVED = 0.98  # of an evaluation's episodes: a run that has never solved so many neither stalls nor ends early
+
 
 def evaluate(
     env: EnvBase, actor: TensorDictModuleBase, episodes: int | None = None
@@ -84,17 +86,19 @@ def last_rise(rows: Sequence[Mapping[str, float]]) -> int:
     return rose
 
 
-def has_levelled_off(
-    rows: Sequence[Mapping[str, float]], patience: float | None, solved: float = 0.5, least: int = 15
-) -> bool:
+def has_levelled_off(rows: Sequence[Mapping[str, float]], patience: float | None, least: int = 30) -> bool:
     """Whether no evaluation of a run has risen for a share ``patience`` of it; never where that is None.
 
-    A run of fewer than ``least`` evaluations goes on, and so does one that has not solved a share ``solved`` of an
-    evaluation's episodes, since returns stay level for long before the first are solved.
+    A run of fewer than ``least`` evaluations goes on; half as many do where the returns since the last rise have stayed
+    within 2 % of the highest. So does one that has never solved the share ``SOLVED`` of an evaluation's episodes, since
+    returns stay level for long before a task is solved.
     """
-    if patience is None or len(rows) < least or max(row["eval/solved"] for row in rows) < solved:
+    if patience is None or not rows or max(row["eval/solved"] for row in rows) < SOLVED:
         return False
-    return last_rise(rows) <= (1.0 - patience) * rows[-1]["steps"]
+    rose, steps = last_rise(rows), rows[-1]["steps"]
+    since = [row["eval/return"] for row in rows if row["steps"] >= rose]
+    is_steady = min(since) >= max(since) - 0.02 * abs(max(since))
+    return len(rows) >= (least // 2 if is_steady else least) and rose <= (1.0 - patience) * steps
 
 
 def has_lost_its_way(rows: Sequence[Mapping[str, float]], patience: float | None) -> bool:
@@ -117,24 +121,25 @@ def has_lost_its_way(rows: Sequence[Mapping[str, float]], patience: float | None
 def next_pace(rows: Sequence[Mapping[str, float]], since: int, patience: float | None, least: int = 10) -> float:
     """By what the actor's rate changes after a run's last evaluation: a quarter where it stalls, 2 where it rises.
 
-    A run stalls that once solved half of an evaluation's episodes, where no evaluation has risen for two thirds of the
-    patience, and at least ``least`` of them have passed since the last rise and since the step ``since``.
+    A run that has solved the share ``SOLVED`` of an evaluation's episodes stalls where none has risen for two thirds of
+    the patience, and at least ``least`` of them have passed since the last rise and since the step ``since``.
     """
     if patience is None or (rose := last_rise(rows)) == rows[-1]["steps"]:
         return 1.0 if patience is None else 2.0
     since = max(since, rose)
-    waited = sum(row["steps"] > since for row in rows) >= least and max(row["eval/solved"] for row in rows) >= 0.5
+    waited = sum(row["steps"] > since for row in rows) >= least and max(row["eval/solved"] for row in rows) >= SOLVED
     return 0.25 if waited and since <= (1.0 - patience * 2 / 3) * rows[-1]["steps"] else 1.0
 
 
 def looks_ahead(rows: Sequence[Mapping[str, float]], patience: float | None) -> bool:
     """Whether a run has solved nine tenths of an evaluation's episodes, or has once levelled off without.
 
-    That is for half of its patience, and after 30 evaluations at the earliest.
+    That is for half of its patience, and after 30 evaluations at the earliest; not where ``patience`` is None.
     """
-    half = patience and patience / 2
-    level = (has_levelled_off(rows[:n], half, solved=0.0, least=30) for n in range(len(rows) + 1))
-    return any(row["eval/solved"] >= 0.9 for row in rows) or any(level)
+    ends = range(30, len(rows) + 1) if patience is not None else ()
+    return any(row["eval/solved"] >= 0.9 for row in rows) or any(
+        last_rise(rows[:n]) <= (1.0 - (patience or 0.0) / 2) * rows[n - 1]["steps"] for n in ends
+    )
 
 
 @contextlib.contextmanager

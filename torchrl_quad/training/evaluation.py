@@ -124,8 +124,10 @@ def next_pace(rows: Sequence[Mapping[str, float]], since: int, patience: float |
     A run that has solved the share ``SOLVED`` of an evaluation's episodes stalls where none has risen for two thirds of
     the patience, and at least ``least`` of them have passed since the last rise and since the step ``since``.
     """
-    if patience is None or (rose := last_rise(rows)) == rows[-1]["steps"]:
-        return 1.0 if patience is None else 2.0
+    if patience is None:
+        return 1.0
+    if (rose := last_rise(rows)) == rows[-1]["steps"]:
+        return 2.0
     since = max(since, rose)
     waited = sum(row["steps"] > since for row in rows) >= least and max(row["eval/solved"] for row in rows) >= SOLVED
     return 0.25 if waited and since <= (1.0 - patience * 2 / 3) * rows[-1]["steps"] else 1.0
@@ -136,10 +138,12 @@ def looks_ahead(rows: Sequence[Mapping[str, float]], patience: float | None) -> 
 
     That is for half of its patience, and after 30 evaluations at the earliest; not where ``patience`` is None.
     """
-    ends = range(30, len(rows) + 1) if patience is not None else ()
-    return any(row["eval/solved"] >= 0.9 for row in rows) or any(
-        last_rise(rows[:n]) <= (1.0 - (patience or 0.0) / 2) * rows[n - 1]["steps"] for n in ends
-    )
+    if any(row["eval/solved"] >= 0.9 for row in rows):
+        return True
+    if patience is None:
+        return False
+    ends = range(30, len(rows) + 1)
+    return any(last_rise(rows[:n]) <= (1.0 - patience / 2) * rows[n - 1]["steps"] for n in ends)
 
 
 @contextlib.contextmanager

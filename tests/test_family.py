@@ -6,8 +6,7 @@ import pickle
 import pytest
 import torch
 from refusals import refuses
-from tensordict import TensorDict
-from test_objectives import GAMMA, LAMBDA, REWARDS, make_abpt, make_networks, make_rollout, td_lambda
+from test_objectives import GAMMA, LAMBDA, REWARDS, doubling, make_abpt, make_networks, make_rollout, td_lambda
 from torch.distributions import Normal
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -105,15 +104,9 @@ def test_the_gradient_of_sapo_is_that_of_finite_differences(env64, clip):
 
 @pytest.mark.parametrize("order", [1, 2])
 def test_pods_asks_for_the_actions_that_raise_the_return(order):
-    """x' = x + a, a = x, and a reward of -x'^2 / 2: from 1 to 2 to 4. The best is x = 0 after one step, and to stay."""
+    """The best is x = 0 after one step, and to stay."""
     actor, _, _ = make_networks(policy=1.0)
-    positions, actions = [torch.ones(1, 1).double()], []
-    for _ in range(2):
-        actions.append(positions[-1] * torch.ones(1, requires_grad=True).double())
-        positions.append(positions[-1] + actions[-1])
-    rollout = TensorDict({"observation": torch.stack(positions[:2], 1), "action": torch.stack(actions, 1)}, [1, 2])
-    ends = dict.fromkeys(("done", "terminated"), torch.zeros(1, 2, 1, dtype=torch.bool))
-    rollout["next"] = TensorDict({"reward": -0.5 * torch.stack(positions[1:], 1) ** 2, **ends}, [1, 2])
+    rollout = doubling(actor)
     loss = PODSLoss(actor, order=order, step=1e9 if order == 2 else 0.1, clip_action_gradient=None).double()
     loss.make_value_estimator(gamma=1.0)
     change = (loss.write_action_target(rollout)["action_target"] - rollout["action"])[0, :, 0]

@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives.utils import ValueEstimators
 
-from torchrl_quad import ABPTLoss, BPTTLoss, SHACLoss
+from torchrl_quad import ABPTLoss, AHACLoss, BPTTLoss, SHACLoss
 
 GAMMA, LAMBDA = 0.5, 0.5
 
@@ -38,6 +38,18 @@ def make_abpt(actor, *critics, **kwargs):
     for params in (loss.qvalue_network_params, loss.target_qvalue_network_params):
         params["module", "weight"].data.copy_(torch.tensor(critics))
     return loss.make_value_estimator(gamma=GAMMA, lmbda=LAMBDA)
+
+
+def doubling(actor):
+    """A rollout of x' = x + a, a = x, with a reward of -x'^2 / 2: from 1 to 2 to 4."""
+    positions, actions = [torch.ones(1, 1).double()], []
+    for _ in range(2):
+        actions.append(positions[-1] * torch.ones(1, requires_grad=True).double())
+        positions.append(positions[-1] + actions[-1])
+    rollout = TensorDict({"observation": torch.stack(positions[:2], 1), "action": torch.stack(actions, 1)}, [1, 2])
+    ends = dict.fromkeys(("done", "terminated"), torch.zeros(1, 2, 1, dtype=torch.bool))
+    later = torch.stack(positions[1:], 1)
+    return rollout.set("next", TensorDict({"observation": later, "reward": -0.5 * later**2, **ends}, [1, 2]))
 
 
 def make_rollout(actor, dtype=torch.float32):
@@ -288,3 +300,14 @@ def test_the_entropy_bonus_is_alpha_times_the_mean_of_minus_log_prob_and_alpha_r
         assert loss.alpha.item() == pytest.approx(0.2)
         assert loss.log_alpha.grad.sign().item() == direction  # gradient descent moves alpha the other way
     assert BPTTLoss(actor, alpha="auto")._target_entropy(make_rollout(actor)) == -1.0
+
+
+@pytest.mark.parametrize(("lmbda", "expected"), [(1.0, (-8.0, -3.0)), (0.5, (-4.5, -3.0))])
+def test_each_action_climbs_its_own_lambda_return(lmbda, expected):
+    """V = x, and x' = 2 x: the first action has -2 + (1 - lambda) 1 + lambda (-8 + 2), the second one -4 + 1."""
+    actor, value, _ = make_networks(policy=1.0, critic=1.0)
+    loss = AHACLoss(actor, value, horizon=2, num_value_nets=1, gradient_lmbda=lmbda).double()
+    rollout = doubling(actor).set("loc", torch.zeros(1, 2, 1)).set("scale", torch.zeros(1, 2, 1))
+    loss.make_value_estimator(gamma=1.0, lmbda=1.0)
+    change = (loss.better_actions(rollout, 0.3)[0] - rollout["action"])[0, :, 0]
+    assert change.tolist() == pytest.approx([0.1 * x for x in expected])  # the median of two is the lower one

@@ -6,13 +6,14 @@ import math
 from typing import Annotated, Any
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives.calls import median_length, with_fixed
 from torchrl_quad.objectives.shac import SHACLoss
-from torchrl_quad.options import Below1, Copies, Field, Horizon
+from torchrl_quad.options import Below1, Copies, Field, Horizon, Share
 
 SMOOTHING = 0.2  # how much of the multiplier is new in each iteration
 
@@ -50,6 +51,9 @@ class AHACLoss(SHACLoss):
         max_stiffness: the bound on the growth of action gradients along a horizon, beyond which it gets shorter; 1.5 to
             5 are usual.
         horizon_lr: the share by which the horizon may change in an iteration.
+        gradient_lmbda: 1 climbs J. Below, each action climbs its own lambda-return, with the critic's value after every
+            step, as in Dreamer (Hafner et al. 2020, arXiv:1912.01603). The rewards of 1 / (1 - lmbda) steps count, and
+            what jumps, such as a target, counts by the critic. 0.98 is usual.
         **kwargs: as for :class:`SHACLoss`.
     """
 
@@ -65,6 +69,7 @@ class AHACLoss(SHACLoss):
         max_horizon: Horizon | None = None,
         max_stiffness: Annotated[float, Field(gt=1, le=1e30)] = 2.0,
         horizon_lr: Below1 = 0.1,
+        gradient_lmbda: Share = 1.0,
         num_value_nets: Copies = 2,
         **kwargs: Any,
     ) -> None:
@@ -75,7 +80,7 @@ class AHACLoss(SHACLoss):
         options = with_fixed(self, kwargs, target_bootstrap=False, delay_value=False)
         super().__init__(actor_network, value_network, num_value_nets=num_value_nets, **options)
         self.min_horizon, self.max_horizon = low, high
-        self.max_stiffness, self.horizon_lr = max_stiffness, horizon_lr
+        self.max_stiffness, self.horizon_lr, self.gradient_lmbda = max_stiffness, horizon_lr, gradient_lmbda
         number = {"device": self._default_device, "dtype": torch.float64}
         self.register_buffer("length", torch.tensor(horizon, **number))
         self.register_buffer("multiplier", torch.zeros((), **number))
@@ -97,6 +102,11 @@ class AHACLoss(SHACLoss):
         excess = (stiffness.to(self.length) / self.max_stiffness - 1.0).clamp(-1.0, 1.0)
         self.multiplier.lerp_(excess, SMOOTHING)
         self.length.mul_((-self.horizon_lr * self.multiplier).exp()).clamp_(self.min_horizon, self.max_horizon)
+
+    def _action_gradient(self, tensordict: TensorDictBase, objective: Tensor) -> Tensor:
+        if self.gradient_lmbda == 1.0:
+            return super()._action_gradient(tensordict, objective)
+        return self._own_gradient(tensordict, self.gradient_lmbda)
 
     def _measure(self, grad: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         length = grad.norm(dim=-1)

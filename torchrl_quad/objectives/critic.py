@@ -14,7 +14,15 @@ from torchrl.objectives.utils import ValueEstimators, distance_loss
 
 from torchrl_quad.data.unwrap import check_tensordict, group, leaf
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.objectives.calls import picked, predict, segments, takes_rollout, td_lambda
+from torchrl_quad.objectives.calls import (
+    action_gradient,
+    discounts,
+    picked,
+    predict,
+    segments,
+    takes_rollout,
+    td_lambda,
+)
 from torchrl_quad.objectives.pathwise import PathwiseLoss
 
 
@@ -152,6 +160,28 @@ class PathwiseCriticLoss(PathwiseLoss):
             return torch.zeros_like(discount).sum((-2, -1))
         value = self._value(next_state, target=self.target_bootstrap)
         return (discount * torch.zeros_like(discount).masked_scatter(where, value.to(discount.dtype))).sum((-2, -1))
+
+    def _own_gradient(self, tensordict: TensorDictBase, lmbda: float) -> Tensor:
+        """The gradient of each action's own lambda-return in that action: (*, horizon, k).
+
+        It weighs n steps and the value after them by (1 - lmbda) lmbda^(n-1), with the rest of the weight at the end of
+        the segment. It is not discounted from the start of the horizon.
+        """
+        reward, terminated = self._reward(tensordict), self._next(tensordict, "terminated")
+        gamma = self._gamma.to(reward.dtype)
+        goes_on = group(tensordict, "next").select(*self._critic_inputs())[~terminated.squeeze(-1)]
+        value = self._value(cast(TensorDictBase, goes_on), target=False).to(reward.dtype)
+        done = self._next(tensordict, "done")
+        bootstrap = torch.where(segments(done)[1], 1.0, 1.0 - lmbda).to(reward.dtype)
+        bootstrap = bootstrap * torch.zeros_like(reward).masked_scatter(~terminated, value)
+        discount = discounts(done, gamma * lmbda)
+        if discount.min() < 1e6 * torch.finfo(reward.dtype).tiny:
+            raise UserValueError(
+                f"gamma * gradient_lmbda = {float(gamma * lmbda):.3g} is too small for a horizon of "
+                f"{reward.shape[-2]} steps: {reward.dtype} cannot divide by its power. Fly fewer, or raise the lmbda."
+            )
+        objective = (discount * (reward + gamma * bootstrap)).sum()
+        return action_gradient(objective, leaf(tensordict, self.tensor_keys.action)) / discount
 
     def _critic_inputs(self) -> set[NestedKey]:
         """The entries of a state that the critic, and the actor before it, read."""

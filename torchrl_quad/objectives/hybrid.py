@@ -16,9 +16,9 @@ from torch.distributions import Normal
 from torch.distributions.transforms import TanhTransform
 from torchrl.objectives.utils import ValueEstimators
 
-from torchrl_quad.data.unwrap import check_tensordict, group, leaf
+from torchrl_quad.data.unwrap import check_tensordict, leaf
 from torchrl_quad.errors import UserValueError, WrongState
-from torchrl_quad.objectives.calls import action_gradient, discounts, plain_of, segments, takes_rollout
+from torchrl_quad.objectives.calls import plain_of, takes_rollout
 from torchrl_quad.objectives.shac import SHACLoss
 from torchrl_quad.options import Below1, Coefficient, Field, Positive, Share
 
@@ -119,7 +119,8 @@ class HybridLoss(SHACLoss):
         self._check_rollout(tensordict)
         if not torch.is_grad_enabled():
             raise WrongState("write_targets differentiates the rollout: call it with gradients enabled.")
-        keys, grad = self.tensor_keys, self._own_gradient(tensordict)
+        keys, grad = self.tensor_keys, self._own_gradient(tensordict, self.gradient_lmbda)
+        grad = grad if self.clip is None else self.clip(grad)[0]
         data = self.write_value_target(tensordict.detach())
         grad, latent, loc = self._in_location(data, grad)
         with torch.no_grad():
@@ -170,25 +171,6 @@ class HybridLoss(SHACLoss):
                 "of all that it returned."
             )
         return self.write_targets(tensordict) if lost else tensordict
-
-    def _own_gradient(self, tensordict: TensorDictBase) -> Tensor:
-        """The gradient of each action's own lambda-return in that action: (*, horizon, k)."""
-        reward, terminated = self._reward(tensordict), self._next(tensordict, "terminated")
-        gamma = self._gamma.to(reward.dtype)
-        goes_on = group(tensordict, "next").select(*self._critic_inputs())[~terminated.squeeze(-1)]
-        value = self._value(cast(TensorDictBase, goes_on), target=False).to(reward.dtype)
-        done = self._next(tensordict, "done")
-        bootstrap = torch.where(segments(done)[1], 1.0, 1.0 - self.gradient_lmbda).to(reward.dtype)
-        bootstrap = bootstrap * torch.zeros_like(reward).masked_scatter(~terminated, value)
-        discount = discounts(done, gamma * self.gradient_lmbda)
-        if discount.min() < 1e6 * torch.finfo(reward.dtype).tiny:
-            raise UserValueError(
-                f"gamma * gradient_lmbda = {float(gamma * self.gradient_lmbda):.3g} is too small for a horizon of "
-                f"{reward.shape[-2]} steps: {reward.dtype} cannot divide by its power. Fly fewer, or raise the lmbda."
-            )
-        objective = (discount * (reward + gamma * bootstrap)).sum()
-        grad = action_gradient(objective, leaf(tensordict, self.tensor_keys.action)) / discount
-        return grad if self.clip is None else self.clip(grad)[0]
 
     def _in_location(self, data: TensorDictBase, grad: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """From the gradient in the actions (*, k) that in their means before the tanh; u, and these means."""

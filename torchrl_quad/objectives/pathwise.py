@@ -271,8 +271,7 @@ class PathwiseLoss(LossModule):
         if self.measured_of_actions and not torch.is_grad_enabled():
             metadata |= dict.fromkeys(self.measured_of_actions, torch.full_like(self.alpha, math.nan))
         elif self.measured_of_actions:
-            action = leaf(tensordict, self.tensor_keys.action)
-            grad, measured = self._measure(action_gradient(objective.sum(), action))
+            grad, measured = self._measure(self._action_gradient(tensordict, objective))
             written = act_again(self.actor_network, self.actor_network_params, tensordict)
             learned = (grad * written[self.tensor_keys.action]).sum((-2, -1)) + self._beside_actions(tensordict)
             # The value is J's; the gradient that of ``learned``.
@@ -298,10 +297,11 @@ class PathwiseLoss(LossModule):
             raise Unsupported(f"better_actions of {type(self).__name__} leaves out its entropy bonus: set alpha to 0.")
         step = check_value("step", step, Positive)
         objective, metadata = self._objective(tensordict)
-        action = leaf(tensordict, self.tensor_keys.action)
-        grad, measured = self._measure(action_gradient(objective.sum(), action))
+        grad, measured = self._measure(self._action_gradient(tensordict, objective))
         change = grad * (step / median_length(grad.norm(dim=-1)))
-        return action.detach() + change.nan_to_num(0.0, 0.0, 0.0), metadata | measured
+        return leaf(tensordict, self.tensor_keys.action).detach() + change.nan_to_num(
+            0.0, 0.0, 0.0
+        ), metadata | measured
 
     def loss_fit(self, tensordict: TensorDictBase) -> Tensor:
         """Half the squared distance of the policy's actions from ``action_target`` in a rollout (*, horizon), whose
@@ -327,6 +327,10 @@ class PathwiseLoss(LossModule):
     def _objective(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         objective = total(self.objective_parts(tensordict).values())
         return objective, {"n_step_return": objective.detach().mean()}
+
+    def _action_gradient(self, tensordict: TensorDictBase, objective: Tensor) -> Tensor:
+        """The gradient to climb in each action that was flown, (*, horizon, k): that of J."""
+        return action_gradient(objective.sum(), leaf(tensordict, self.tensor_keys.action))
 
     def _beside_actions(self, tensordict: TensorDictBase) -> Tensor | float:
         """What of J depends on the policy at fixed states, apart from the actions that were flown: (*)."""

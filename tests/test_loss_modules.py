@@ -167,6 +167,7 @@ def test_the_example_of_a_loss_is_short_and_runs(loss):
     (AHACLoss, {"horizon": 4, "min_horizon": 8}, "horizon=4 must lie between min_horizon=8 and max_horizon=8"),
     (AHACLoss, {"horizon": 0}, "horizon must be at least 1, got 0. Control steps of the first rollout"),
     (AHACLoss, {"max_stiffness": 1.0}, "max_stiffness must be greater than 1, got 1.0. .*1.5 to 5 are usual"),
+    (AHACLoss, {"gradient_lmbda": 0.9, "terminal_gradient": False}, "terminal_gradient=False cuts: leave one of them"),
     (AHACLoss, {"horizon_lr": 1.0}, "horizon_lr must be less than 1, got 1.0"),
     (HybridLoss, {"gradient_lmbda": 0.0}, "gradient_lmbda must be greater than 0"),
     (HybridLoss, {"clip_epsilon": 1.0}, "clip_epsilon must be less than 1"),

@@ -79,6 +79,11 @@ class AHACLoss(SHACLoss):
             raise UserValueError(f"horizon={horizon} must lie between min_horizon={low} and max_horizon={high}.")
         options = with_fixed(self, kwargs, target_bootstrap=False, delay_value=False)
         super().__init__(actor_network, value_network, num_value_nets=num_value_nets, **options)
+        if gradient_lmbda < 1.0 and not self.terminal_gradient:
+            raise UserValueError(
+                f"gradient_lmbda={gradient_lmbda} takes the critic's gradient after every step, which "
+                "terminal_gradient=False cuts: leave one of them out."
+            )
         self.min_horizon, self.max_horizon = low, high
         self.max_stiffness, self.horizon_lr, self.gradient_lmbda = max_stiffness, horizon_lr, gradient_lmbda
         number = {"device": self._default_device, "dtype": torch.float64}
@@ -106,7 +111,8 @@ class AHACLoss(SHACLoss):
     def _action_gradient(self, tensordict: TensorDictBase, objective: Tensor) -> Tensor:
         if self.gradient_lmbda == 1.0:
             return super()._action_gradient(tensordict, objective)
-        return self._own_gradient(tensordict, self.gradient_lmbda)
+        grad = self._own_gradient(tensordict, self.gradient_lmbda)
+        return grad / tensordict.shape[-1] if self.average_over_horizon else grad
 
     def _measure(self, grad: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         length = grad.norm(dim=-1)

@@ -146,20 +146,24 @@ class PathwiseCriticLoss(PathwiseLoss):
 
     def _discounted_value(self, tensordict: TensorDictBase, after: Tensor) -> Tensor:
         """gamma^(t+1) V(s_(t+1)) after steps (*, horizon, 1), but for those that terminated, summed over steps: (*)."""
-        where = after & ~self._next(tensordict, "terminated")
-        states, inputs = group(tensordict, "next"), self._critic_inputs()
         discount = self._gamma * self._discounts(tensordict)
+        return (discount * self._value_after(tensordict, after & ~self._next(tensordict, "terminated"))).sum((-2, -1))
+
+    def _value_after(self, tensordict: TensorDictBase, where: Tensor) -> Tensor:
+        """V(s_(t+1)) after the steps in ``where``, and zero after the others: (*, horizon, 1), with its graph."""
+        states, inputs = group(tensordict, "next"), self._critic_inputs()
+        zeros = torch.zeros_like(self._next(tensordict, "reward"))
         if torch.compiler.is_compiling() and not self.samples_actions:
             # All states, since a compiler is slow where a mask gives the shape; earlier ones stand in for the others.
             known, stand_in = (td.select(*inputs, strict=False) for td in (states, tensordict.detach()))
             dense = cast(TensorDictBase, known.where(where.squeeze(-1), stand_in).reshape(-1))
-            value = self._value(dense, target=self.target_bootstrap).view(where.shape).to(discount.dtype)
-            return (discount * torch.where(where, value, 0.0)).sum((-2, -1))
+            value = self._value(dense, target=self.target_bootstrap).view(where.shape).to(zeros.dtype)
+            return torch.where(where, value, 0.0)
         next_state = picked(states, inputs, where)
         if not torch.compiler.is_compiling() and len(next_state) == 0:  # a recurrent policy refuses an empty batch
-            return torch.zeros_like(discount).sum((-2, -1))
+            return zeros
         value = self._value(next_state, target=self.target_bootstrap)
-        return (discount * torch.zeros_like(discount).masked_scatter(where, value.to(discount.dtype))).sum((-2, -1))
+        return zeros.masked_scatter(where, value.to(zeros.dtype))
 
     def _own_gradient(self, tensordict: TensorDictBase, lmbda: float) -> Tensor:
         """The gradient of each action's own lambda-return in that action: (*, horizon, k).
@@ -167,13 +171,9 @@ class PathwiseCriticLoss(PathwiseLoss):
         It weighs n steps and the value after them by (1 - lmbda) lmbda^(n-1), with the rest of the weight at the end of
         the segment. It is not discounted from the start of the horizon.
         """
-        reward, terminated = self._reward(tensordict), self._next(tensordict, "terminated")
-        gamma = self._gamma.to(reward.dtype)
-        goes_on = group(tensordict, "next").select(*self._critic_inputs())[~terminated.squeeze(-1)]
-        value = self._value(cast(TensorDictBase, goes_on), target=False).to(reward.dtype)
-        done = self._next(tensordict, "done")
-        bootstrap = torch.where(segments(done)[1], 1.0, 1.0 - lmbda).to(reward.dtype)
-        bootstrap = bootstrap * torch.zeros_like(reward).masked_scatter(~terminated, value)
+        reward, done = self._reward(tensordict), self._next(tensordict, "done")
+        gamma, weight = self._gamma.to(reward.dtype), torch.where(segments(done)[1], 1.0, 1.0 - lmbda).to(reward.dtype)
+        bootstrap = weight * self._value_after(tensordict, ~self._next(tensordict, "terminated"))
         discount = discounts(done, gamma * lmbda)
         if discount.min() < 1e6 * torch.finfo(reward.dtype).tiny:
             raise UserValueError(

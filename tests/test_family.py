@@ -106,7 +106,7 @@ def test_the_gradient_of_sapo_is_that_of_finite_differences(env64, clip):
 def test_pods_asks_for_the_actions_that_raise_the_return(order):
     """The best is x = 0 after one step, and to stay."""
     actor, _, _ = make_networks(policy=1.0)
-    rollout = doubling(actor)
+    rollout = doubling()
     loss = PODSLoss(actor, order=order, step=1e9 if order == 2 else 0.1, clip_action_gradient=None).double()
     loss.make_value_estimator(gamma=1.0)
     change = (loss.write_action_target(rollout)["action_target"] - rollout["action"])[0, :, 0]

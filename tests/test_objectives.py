@@ -40,7 +40,7 @@ def make_abpt(actor, *critics, **kwargs):
     return loss.make_value_estimator(gamma=GAMMA, lmbda=LAMBDA)
 
 
-def doubling(actor):
+def doubling():
     """A rollout of x' = x + a, a = x, with a reward of -x'^2 / 2: from 1 to 2 to 4."""
     positions, actions = [torch.ones(1, 1).double()], []
     for _ in range(2):
@@ -307,7 +307,7 @@ def test_each_action_climbs_its_own_lambda_return(lmbda, expected):
     """V = x, and x' = 2 x: the first action has -2 + (1 - lambda) 1 + lambda (-8 + 2), the second one -4 + 1."""
     actor, value, _ = make_networks(policy=1.0, critic=1.0)
     loss = AHACLoss(actor, value, horizon=2, num_value_nets=1, gradient_lmbda=lmbda).double()
-    rollout = doubling(actor).set("loc", torch.zeros(1, 2, 1)).set("scale", torch.zeros(1, 2, 1))
+    rollout = doubling().set("loc", torch.zeros(1, 2, 1)).set("scale", torch.zeros(1, 2, 1))
     loss.make_value_estimator(gamma=1.0, lmbda=1.0)
     change = (loss.better_actions(rollout, 0.3)[0] - rollout["action"])[0, :, 0]
     assert change.tolist() == pytest.approx([0.1 * x for x in expected])  # the median of two is the lower one

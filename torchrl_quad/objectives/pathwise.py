@@ -289,9 +289,9 @@ class PathwiseLoss(LossModule):
     def better_actions(self, tensordict: TensorDictBase, step: float = 0.1) -> tuple[Tensor, dict[str, Tensor]]:
         """Actions (*, horizon, k) that raise J, to fit the policy to (Mora et al. 2021), and the metadata.
 
-        Each action of the rollout, which carries its graph, moves along the gradient of J in it; the median of these
-        changes has the length ``step``, in units of the action. :meth:`loss_fit` is the distance from them. What J has
-        beside the flown actions, as ABPT has, does not count, and an entropy bonus is refused.
+        Each action of the rollout, which carries its graph, moves along the gradient that the loss climbs in it; the
+        median of these changes has the length ``step``, in units of the action. :meth:`loss_fit` is the distance from
+        them. What J has beside the flown actions, as ABPT has, does not count, and an entropy bonus is refused.
         """
         if self.has_entropy_bonus:
             raise Unsupported(f"better_actions of {type(self).__name__} leaves out its entropy bonus: set alpha to 0.")
@@ -299,9 +299,8 @@ class PathwiseLoss(LossModule):
         objective, metadata = self._objective(tensordict)
         grad, measured = self._measure(self._action_gradient(tensordict, objective))
         change = grad * (step / median_length(grad.norm(dim=-1)))
-        return leaf(tensordict, self.tensor_keys.action).detach() + change.nan_to_num(
-            0.0, 0.0, 0.0
-        ), metadata | measured
+        action = leaf(tensordict, self.tensor_keys.action).detach()
+        return action + change.nan_to_num(0.0, 0.0, 0.0), metadata | measured
 
     def loss_fit(self, tensordict: TensorDictBase) -> Tensor:
         """Half the squared distance of the policy's actions from ``action_target`` in a rollout (*, horizon), whose

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import yaml
 
 pytest.register_assert_rewrite("browsing", "deploying", "flying", "log_writers", "small_runs")
 
@@ -93,6 +94,9 @@ def launch(monkeypatch, capsys):
     """``python recipes/NAME.py ARGUMENTS``, but in this process, where it starts quicker and parts can be replaced."""
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
     monkeypatch.setenv("WANDB_MODE", "offline")
+    # Hydra composes a configuration once more to find its mode, which none of ours sets, and reads YAML in Python.
+    monkeypatch.setattr("hydra._internal.hydra.Hydra.get_mode", lambda *args, **kwargs: None)
+    monkeypatch.setattr("yaml.SafeLoader", yaml.CSafeLoader)
 
     def launch(name, *arguments):
         monkeypatch.setattr(sys, "argv", [f"recipes/{name}.py", *map(str, arguments)])

@@ -165,11 +165,16 @@ def test_a_run_has_lost_its_way_where_it_solves_a_third_less_and_its_return_fell
     assert has_lost_its_way(rows, 0.5) == lost and not has_lost_its_way(rows, None)
 
 
-def test_the_best_policy_solves_most_and_with_a_patience_to_the_nearest_2_percent():
+def test_the_best_policy_solves_most_and_with_a_patience_to_the_nearest_2_percent_and_half_at_least():
     early, late = {"solved": 1.0, "return": 112.7}, {"solved": 127 / 128, "return": 141.5}
     none, first = {"solved": 125 / 128, "return": 150.0}, {"solved": -math.inf, "return": -math.inf}
     assert max([first, early, late, none], key=lambda score: merit(score, None)) == early
     assert max([first, early, late, none], key=lambda score: merit(score, 0.5)) == late
+    crashes, comes_near = {"solved": 27 / 128, "return": 17.4}, {"solved": 17 / 128, "return": 28.5}
+    assert max([first, crashes, comes_near], key=lambda score: merit(score, None)) == crashes
+    assert max([first, crashes, comes_near], key=lambda score: merit(score, 0.5)) == comes_near
+    half = {"solved": 0.5, "return": 10.0}
+    assert max([first, crashes, half, comes_near], key=lambda score: merit(score, 0.5)) == half
 
 
 def test_the_rate_quarters_where_nothing_has_risen_for_two_thirds_of_the_patience_and_doubles_with_each_rise():

@@ -146,8 +146,8 @@ def judged(actor, seed=99, **options):
 
 
 def test_shac_learns_to_hover_in_seconds():
-    coarse = {"num_envs": 64, "control_dt": 0.05, "dt": 0.01, "max_episode_steps": 100}  # few steps a second of flight
-    iterations = 60
+    coarse = {"dynamics": "point_mass", "num_envs": 64, "control_dt": 0.05, "dt": 0.05, "max_episode_steps": 100}
+    iterations = 70
     env = HoveringEnv(seed=0, **coarse)
     actor = make_actor(env, input_scale=0.5)
     loss = SHACLoss(actor, make_value(env, input_scale=0.5))

@@ -38,7 +38,7 @@ SEEING = [  # and remembering: a memory, images on their way, and noise that goe
 
 
 @cases(
-    *((recipe, [*EVERYTHING, *ENTROPY]) for recipe in ("abpt", "ahac", "shac", "sapo")),
+    *((recipe, [*EVERYTHING, *ENTROPY]) for recipe in ("abpt", "ahac", "shac")),  # SAPO keeps what SHAC does
     ("hybrid", EVERYTHING),
     ("train", [*(x for x in EVERYTHING if "max_kl" not in x), ENTROPY[1]]),
     ("ppo", ["normalize=true", *EVERYTHING[-3:], "compile=true"]),

@@ -65,10 +65,13 @@ def merit(score: Mapping[str, float], patience: float | None) -> tuple[float, fl
     """What makes a policy the best of a run: first the episodes solved, then the return.
 
     With a ``patience`` the run goes back to that policy, so the episodes count to the nearest 2 %: otherwise one
-    evaluation that happened to solve all would hold it for good.
+    evaluation that happened to solve all would hold it for good. Below a half of them the return alone counts: an
+    early policy may solve a fifth, and crash in all others.
     """
     solved = score["solved"]
-    return solved if patience is None or math.isinf(solved) else round(50 * solved) / 50, score["return"]
+    if patience is not None and not math.isinf(solved):
+        solved = round(50 * solved) / 50 if solved >= 0.5 else 0.0
+    return solved, score["return"]
 
 
 def last_rise(rows: Sequence[Mapping[str, float]]) -> int:

@@ -78,9 +78,9 @@ class Run:
     Every ``eval.interval`` iterations the run writes a row of metrics and a checkpoint, which holds all that it needs
     to continue bit for bit, and the best policy so far: the one that solved most episodes in an evaluation, and of
     those the one with the greatest return. At the end that policy flies from other starts. With ``eval.patience``,
-    episodes solved count to the nearest 2 %, and a run that has lost its way goes back to its best policy, with its
-    critics and optimisers; so does a run that has stalled, at a quarter of the actor's rate, which doubles with each
-    evaluation that rises again.
+    episodes solved count to the nearest 2 %, and below a half not at all. A run that has lost its way then goes back to
+    its best policy, with its critics and optimisers; so does a run that has stalled, at a quarter of the actor's rate,
+    which doubles with each evaluation that rises again.
 
     The seconds are those of the loop, without set-up, compilation, evaluations and checkpoints.
 

@@ -63,7 +63,7 @@ def harder(name):
     return env, pilot(env, **PILOTS.get(task, {}))
 
 
-SLOW = ["ring"]  # another task of one's own, beside the relay
+SLOW = ["ring", "hovering"]  # whose rules are like those of the relay, and of tracking
 
 
 @pytest.mark.parametrize("task", [pytest.param(x, marks=[pytest.mark.slow] * (x in SLOW)) for x in HARDER])

@@ -4,7 +4,7 @@ python recipes/import_drone.py cf2x.urdf motor_time_constant=0.07
 
 It writes a YAML file, with its source and every assumption in comments, and says which fields the file lacks. Settings:
 
-    output=PATH          the file to write; without it, outputs/drones/NAME.yaml
+    output=PATH          the file to write; without it, outputs/drones/NAME.yaml, by the entry, the file, or its folder
     entry=NAME           which drone, of a file that has several
     FIELD=NUMBERS        what the file does not say, in SI units, such as linear_drag=[0.1,0.1,0.1]
 """
@@ -23,7 +23,9 @@ def main() -> None:
         print(__doc__)
         return
     path, cfg = settings(sys.argv[1:])
-    output = Path(cfg.pop("output", None) or f"outputs/drones/{path.name.split('.')[0]}.yaml")
+    name = path.name.split(".")[0]
+    name = cfg.get("entry") or (path.absolute().parent.name if name == "model" else name)  # many SDF are model.sdf
+    output = Path(cfg.pop("output", None) or f"outputs/drones/{name}.yaml")
     if output.exists() and path.exists() and output.samefile(path):
         raise UserValueError(f"output={output} is the file that is read. Choose another.")
     text = import_drone(path, **cfg)

@@ -340,7 +340,21 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_th
     ),
     ("x.urdf", URDF.format("cf", 4e-4), r"inertia \[kg m2\]: its products of inertia are not small, 0.0004 kg m2"),
     ("x.sdf", sdf(FRAME + motors(motorConstant=2e-5)), "rotors differ in motorConstant"),
-    ("x.sdf", sdf("<include><uri>model://other</uri></include>"), "includes the model 'other': put it at "),
+    ("x.sdf", sdf(FRAME.replace(J, "") + motors()), "inertia .*: the link 'base_link' has a mass and no <inertia>"),
+    ("x.sdf", sdf(FRAME + motors() + "<plugin filename='gz-sim-lift-drag'/>"), r"it has wings \(LiftDrag\)"),
+    (
+        "x.sdf",
+        sdf(FRAME.replace("'j0'/>", "'j9'/>")),
+        "a pose is relative to 'j9', which is no link",
+    ),
+    ("x.sdf", sdf(FRAME.replace("0.1 0 0 0<", "0.1 3.141592654 0 0<") + motors()), "let rotor_direction point up"),
+    ("x.urdf", URDF.format("cf", 0).replace("'prop", "'w"), "rotor_positions .* no link with an <inertial> is named"),
+    (
+        "x.json",
+        json.dumps({**ROTORPY, "mass": None}),
+        "mass .*, linear_drag .*: it follows from the drag of the rotors",
+    ),
+    ("x.sdf", sdf("<include><uri>model://other</uri></include>"), "includes the model 'model://other': put it at "),
     ("x.urdf", "<!DOCTYPE x [<!ENTITY a 'b'>]><robot>&a;</robot>", "declares entities or a type"),
     ("x.sdf", sdf(FRAME.replace("0.02<", "much<")), "expected 1 number, got 'much'"),
     ("x.xml", "<mujoco/>", "XML with the root <mujoco> is no URDF or SDF .* These can be read: URDF"),
@@ -359,6 +373,53 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_th
 def test_what_cannot_become_a_drone_is_refused_with_all_that_is_missing(file, text, message, tmp_path):
     (tmp_path / file).write_text(text)
     refuses(message, import_drone, tmp_path / file)
+
+
+def test_parts_of_a_model_stand_where_its_simulator_puts_them(tmp_path):
+    """A payload 0.2 m below the body, which is written in several ways; frames of masses turn no rotor."""
+    given = {"yaw_torque_coefficient": 0.02}
+    load = "<link name='load'><pose relative_to='{}'>0 0 {} 0 0 0</pose><inertial><mass>1</mass>" + J
+    load += "</inertial></link>"
+    turned = FRAME.replace("<inertial><mass>0.25<", "<inertial><pose>0 0 0 0 0.2 0</pose><mass>0.25<")
+    (tmp_path / "frame").mkdir()
+    (tmp_path / "frame/model.sdf").write_text(sdf("<pose>0 0 0.24 0 0 0</pose>" + FRAME))
+    include = "<include{}><uri>{}</uri>{}</include>"
+    ways = (
+        FRAME + load.format("base_link", -0.2),
+        turned + load.format("__model__", -0.2),
+        include.format(" merge='true'", "model://frame/", "") + load.format("base_link", -0.2),
+        include.format("", "https://host/1.0/owner/models/frame/3", "<name>v</name>") + load.format("v", 0.04 - 0.24),
+        include.format("", "file://frame/model.sdf", "<pose>0 0 1 0 0 0</pose>") + load.format("x::base_link", -0.2),
+        f"<model name='m'><pose>0 0 3 0 0 0</pose>{FRAME}</model>" + load.format("m::base_link", -0.2),
+    )
+    for i, way in enumerate(ways):
+        (tmp_path / f"{i}").mkdir()
+        (tmp_path / f"{i}/MODEL.SDF").write_text(sdf(way + motors()))
+        drone = load_drone(tmp_path / f"{i}/MODEL.SDF", torch.float64, **given)
+        height = 2 * 1 / 3 * (0.2 + 0.05) ** 2  # of the other 2 kg, whose centre is 5 cm above the body
+        np.testing.assert_allclose(drone.inertia, [0.035 + height, 0.085 + height, 0.1], atol=1e-6, err_msg=way)
+        assert drone.rotor_direction is None
+
+
+def test_rotors_are_found_by_their_names_and_axes_and_what_follows_from_a_given_mass_follows(tmp_path):
+    flat = URDF.format("cf", 0).replace("'prop", "'motor")
+    guards = "".join(f"<link name='prop_guard_{i}'><inertial/></link>" for i in range(4))
+    turned = "".join(
+        f"<joint name='j{i}' type='continuous'><parent link='base_link'/><child link='motor{i}_link'/>"
+        f"<origin rpy='1.5707963 0 0'/><axis xyz='0 {-1 if i else 1} 0'/></joint>"
+        for i in range(4)
+    )
+    guarded = flat.replace("base_link", "quadrotor1_base").replace("</robot>", guards + "</robot>")
+    (tmp_path / "x.urdf").write_text(guarded)
+    wanted = load_drone(tmp_path / "x.urdf", torch.float64, motor_time_constant=0.05)
+    assert "of motor0_link, motor1_link" in import_drone(tmp_path / "x.urdf", motor_time_constant=0.05)
+    lying = flat.replace("<origin xyz='0.2 -0.1 0'", "<origin xyz='0.2 0 0.1'").replace("</robot>", turned + "</robot>")
+    (tmp_path / "y.URDF").write_text(lying)
+    upright = load_drone(tmp_path / "y.URDF", torch.float64, motor_time_constant=0.05)
+    assert upright.rotor_direction is None
+    heavy = load_drone(tmp_path / "x.urdf", torch.float64, motor_time_constant=0.05, mass=1.6)
+    torch.testing.assert_close(heavy.linear_drag, 2.0 * wanted.linear_drag)  # rotors turn twice as fast to carry it
+    torch.testing.assert_close(heavy.rotor_speed_max, 2.0 * wanted.rotor_speed_max)
 
 
 def test_the_recipe_writes_a_drone_from_a_model_and_what_it_includes(tmp_path, monkeypatch, capsys):

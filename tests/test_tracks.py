@@ -249,8 +249,14 @@ def test_tracks_of_other_projects_are_read_and_what_was_assumed_is_said(tmp_path
     rounds = load_track({**POINTS, "gates": [[0, 0, 1], [4, 0, 1], [4, 4, 1]] * 2 + [[0, 0, 1]]})
     assert rounds["closed"] and len(rounds["gates"]) == 3 and rounds["starts"][0] == [-5, 4, 1]
     poses = {"2": {"pos": (4.0, 0.0, 1.0), "yaw": 1.0}, "1": {"pos": (0.0, 0.0, 0.0), "yaw": 0.0}}
-    isaac = load_track(poses, lift=0.9, radius=0.7)
-    assert [gate["position"] for gate in isaac["gates"]] == [[0, 0, 0.9], [4, 0, 1.9]]
+    (tmp_path / "isaac.YAML").write_text(
+        "track_config:\n  2: {pos: [4, 0, 1], yaw: 1}\n  1: {pos: [0, 0, 0], yaw: 0}\n"
+    )
+    for track in (poses, str(tmp_path / "isaac.YAML")):
+        isaac = load_track(track, lift=0.9, radius=0.7)
+        assert [gate["position"] for gate in isaac["gates"]] == [[0, 0, 0.9], [4, 0, 1.9]]
+    (tmp_path / "free.toml").write_text("\ufeff" + LSY.replace("obstacles = [{pos = [1.0, 0.75, 1.5]}]", ""))
+    assert "scene" not in load_track(tmp_path / "free.toml")
 
 
 AGILE = {"start_pos": [-5, 0, 2], "goal_pos": [8, 0, 2]}
@@ -273,7 +279,9 @@ SQUARE = {"position": [0, 0, 2], "yaw": 0.0, **OPEN}
     ({"gates": [[0, 0, 1], [1, 1, 1]], "frame": 0.1}, {}, "frame is of gates with a direction; these are points"),
     ({"random": {"gates": 3, "turn": 2.0}}, {"radius": 1.0}, "3 gates need a turn of at least 2.09 rad, got 2"),
     ({"random": {"spacing": [4, 2]}}, {"radius": 1.0}, "spacing and heights are the least and then the greatest"),
-    ({"env": {"track": {"gates": []}}}, {}, "track: cannot be read, "),
+    ({"env": {"track": {"gates": []}}}, {}, "track: cannot be read .*: it does not say 'drones'"),
+    ({"goal_pos": [8, 0, 2], "gates": ROW}, {}, r"does not say start_pos. Give load_track\(..., start_pos=\[x, y, z\]"),
+    ({**AGILE, "gates": {"Start": ROW["Gate1"], **ROW}}, {}, "The name of gate 'Start' has no number. Number them"),
     ({"gates": [{**SQUARE, "position": 5}, SQUARE]}, {}, "gates must be a list of points .* got .5, .0, 0, 2.."),
     ({"gates": [SQUARE, SQUARE], "gate_radius": 0.3}, {}, "gate_radius is of gates that are points; .* Give radius"),
     ({"random": {"heights": [-1, 4]}}, {"radius": 1.0}, "random: heights must be above the floor at 0 m; got .-1, 4."),

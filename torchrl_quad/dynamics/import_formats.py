@@ -1,11 +1,10 @@
-"""What files of other projects say of a drone: mappings, and URDF and SDF, whose links are one rigid body."""
+"""What mappings of other projects say of a drone, and what all importers share."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
-import re
-import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from torchrl_quad.dynamics import presets
 from torchrl_quad.dynamics.parameters import FIELDS
-from torchrl_quad.errors import UserValueError, one_line, shown
+from torchrl_quad.errors import UserValueError, one_line
 
 Array = NDArray[np.float64]
 Found = dict[str, tuple[Any, str]]  # of a field: its value, None where there is none, and a note
@@ -25,8 +24,7 @@ READABLE = (
     "(rl-tools) and of RotorPy's quad_params, and our own YAML and TOML."
 )
 AXES = ("xx", "yy", "zz", "xy", "xz", "yz")
-DEPTH = 20  # of models, joints and frames within each other
-Links = dict[str, tuple[float, Array, Array]]  # of each: its mass, the frame of its centre of mass, its inertia there
+GIVEN = "given, not in the file"
 
 
 def read_text(path: Path) -> str:
@@ -50,10 +48,13 @@ def read_json(path: Path) -> Any:
 
 
 class Said:
-    """The numbers of a mapping, by name; it keeps account of the names that were asked for."""
+    """The numbers of a mapping, by name; it keeps account of the names that were asked for.
 
-    def __init__(self, data: Mapping[str, Any], source: str) -> None:
-        self.data, self.source, self.asked = data, source, set[str]()
+    Fields that are ``given`` beside the file count instead of its own, also for what follows from them.
+    """
+
+    def __init__(self, data: Mapping[str, Any], source: str, given: Found) -> None:
+        self.data, self.source, self.given, self.asked = data, source, given, set[str]()
 
     def __call__(self, name: str, *shape: int | None) -> Any:
         """An array of this shape, in which None is any length; or None, where the mapping has no such name."""
@@ -73,12 +74,24 @@ class Said:
     def fields(self, **names: str) -> Found:
         """Fields that the mapping has under other names, as they are."""
         shapes = {x: () if FIELDS[x]["shape"] == (1,) else FIELDS[x]["shape"] for x in names}
-        return {x: (self(name, *(None if n == "n" else n for n in shapes[x])), "") for x, name in names.items()}
+        said = {x: (self(name, *(None if n == "n" else n for n in shapes[x])), "") for x, name in names.items()}
+        return said | self.given
+
+
+def usable(given: Mapping[str, Any]) -> Found:
+    """Of the fields that are given beside a file, those from whose numbers others can follow."""
+    found: Found = {}
+    for name, value in given.items():
+        with contextlib.suppress(ValueError, TypeError, RecursionError, KeyError):
+            array, shape = presets.as_array(value), FIELDS[name]["shape"]
+            if array.ndim == (0 if shape == (1,) else len(shape)):
+                found[name] = array, GIVEN
+    return found
 
 
 def placed(positions: Array, directions: Array | None = None, note: str = "") -> Found:
     """Where rotors (n, 3) are, and where they point if they are tilted; of upright ones the height does not count."""
-    if directions is None or np.allclose(directions[:, :2], 0.0, atol=1e-6):
+    if directions is None or np.allclose(directions, [0.0, 0.0, 1.0], atol=1e-6):
         return {"rotor_positions": (positions[:, :2], note)}
     return {"rotor_positions": (positions, note), "rotor_direction": (directions, "")}
 
@@ -124,6 +137,8 @@ def add_drag(found: Found, sides: float | None, up: float | None) -> None:
     if sides is not None and mass and curve is not None and places is not None:
         total = len(places) * speed_at(9.81 * mass / len(places), curve)
         found["linear_drag"] = total * np.array([sides, sides, up or 0.0]), "the rotors', at hover"
+    elif sides is not None:
+        found["linear_drag"] = None, "it follows from the drag of the rotors once mass, thrust and places are known"
 
 
 # -- mappings ----------------------------------------------------------------------------------------------------------
@@ -217,6 +232,7 @@ def _rotorpy(said: Said) -> Found:
     if k2 is not None:
         found["thrust_map"] = [k2, 0.0, 0.0], ""
         found["yaw_torque_coefficient"] = (None if torque is None else torque / k2), "k_m per k_eta"
+        found |= said.given
         add_drag(found, said("k_d"), said("k_z"))
     return found
 
@@ -227,193 +243,3 @@ MAPPINGS: dict[str, tuple[Any, ...]] = {  # by kind: how it is read, and names t
     "drone-models": (_drone_models, "rpm2thrust", "mixing_matrix"),
     "RotorPy": (_rotorpy, "k_eta", "rotor_pos"),
 }
-
-
-# -- URDF and SDF ------------------------------------------------------------------------------------------------------
-
-
-def read_xml(path: Path) -> tuple[str, str, Found, list[str]]:
-    """Of a URDF or SDF: its path, its kind, what it says, and which of its attributes were not read."""
-    root, links, plugins = _xml(path), Links(), list[ET.Element]()
-    model = root if root.tag == "model" else root.find("model")
-    if root.tag == "robot":
-        _add_urdf(root, links, str(path))
-        plugins += root.iter("plugin")
-    elif model is not None:
-        _add_sdf(model, np.eye(4), path, links, plugins)
-    else:
-        raise UserValueError(
-            f"{path}: XML with the root <{one_line(root.tag)}> is no URDF or SDF with a model. {READABLE}"
-        )
-    motors = sorted(
-        (x for x in plugins if x.find("motorConstant") is not None), key=lambda x: _digits(x.findtext("motorNumber"))
-    )
-    short = {re.split("/|::", name)[-1]: name for name in links}
-    rotors = [short.get(re.split("/|::", (x.findtext("linkName") or "").strip())[-1], "") for x in motors]
-    for word in ("rotor", "prop", "motor"):
-        rotors = rotors or sorted((x for x in links if re.search(rf"{word}\D*\d+", x.lower())), key=_digits)
-    if "" in rotors:
-        raise UserValueError(f"{path}: the linkName of a motor is that of no link with an <inertial>. Add it.")
-    found = _body(links, rotors)
-    _add_motors(found, motors, str(path))
-    if (said := root.find("properties")) is not None and root.tag == "robot":
-        numbers = Said({name: presets.parse(text.encode(), name) for name, text in said.attrib.items()}, str(path))
-        _add_attributes(found, numbers, root.get("name", ""))
-        return str(path), "URDF of gym-pybullet-drones", found, [x for x in said.attrib if x not in numbers.asked]
-    return str(path), "URDF" if root.tag == "robot" else "SDF", found, []
-
-
-def _digits(name: str | None) -> list[int]:
-    return [int(x) for x in re.findall(r"\d+", name or "")]
-
-
-def _xml(path: Path) -> ET.Element:
-    text = read_text(path)
-    text = text[max(text.find("<?xml"), 0) :]  # before which Gazebo allows comments
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # a few lines of which can mean billions of characters
-        raise UserValueError(f"{path}: it declares entities or a type. Write the values out instead.")
-    try:
-        return ET.fromstring(text)
-    except (ET.ParseError, ValueError) as error:
-        raise UserValueError(f"{path}: not an XML file: {one_line(error)}.") from None
-
-
-def _numbers(text: str | None, n: int, source: str) -> Array:
-    """So many numbers; zeros where there is nothing."""
-    try:
-        values = np.array((text or "").split() or [0.0] * n, float)
-    except ValueError:
-        values = np.empty(0)
-    if len(values) != n:
-        raise UserValueError(f"{source}: expected {n} number{'s' * (n > 1)}, got {shown(text)}.")
-    return values
-
-
-def _frame(xyz: Array, rpy: Array) -> Array:
-    """Where something stands in what holds it, (4, 4): turned about x, then y, then z."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
-    about = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]) @ np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    frame = np.eye(4)
-    frame[:3, :3], frame[:3, 3] = about @ np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]]), xyz
-    return frame
-
-
-def _add_urdf(root: ET.Element, links: Links, source: str) -> None:
-    def origin(element: ET.Element) -> Array:
-        found = element.find("origin")
-        return np.eye(4) if found is None else _frame(*(_numbers(found.get(x), 3, source) for x in ("xyz", "rpy")))
-
-    def end(joint: ET.Element, name: str) -> str:
-        return getattr(joint.find(name), "attrib", {}).get("link", "")
-
-    joints = {end(joint, "child"): joint for joint in root.iterfind("joint")}
-    for link in root.iterfind("link"):
-        above, frame = link.get("name", ""), np.eye(4)
-        if (inertial := link.find("inertial")) is None:
-            continue
-        for _ in range(DEPTH):  # up to the root; no further where they make a circle
-            if above in joints:
-                frame, above = origin(joints[above]) @ frame, end(joints[above], "parent")
-        about = {x.tag: x.attrib for x in inertial}
-        mass, *moments = (
-            _numbers(about.get(tag, {}).get(name), 1, source)[0]
-            for tag, name in (("mass", "value"), *(("inertia", f"i{axes}") for axes in AXES))
-        )
-        links[link.get("name", "")] = mass, frame @ origin(inertial), symmetric(*moments)
-
-
-def _add_sdf(
-    model: ET.Element, outer: Array, path: Path, links: Links, plugins: list[ET.Element], depth: int = 0
-) -> None:
-    """Add the links and plugins of a model and of those within it, in the frame of the outermost."""
-
-    def own(element: ET.Element) -> Array:
-        pose = _numbers(element.findtext("pose"), 6, str(path))
-        in_degrees = any(x.get("degrees") in ("true", "1") for x in element.iterfind("pose"))
-        return _frame(pose[:3], np.radians(pose[3:]) if in_degrees else pose[3:])
-
-    def standing(element: ET.Element, steps: int = 0) -> Array:
-        pose, child = element.find("pose"), element.findtext("child", "").strip() if element.tag == "joint" else ""
-        base = ("" if pose is None else pose.get("relative_to", "")) or element.get("attached_to", "") or child
-        return (standing(names[base], steps + 1) if base in names and steps < DEPTH else outer) @ own(element)
-
-    if depth > DEPTH:
-        raise UserValueError(f"{path}: more than {DEPTH} models lie within each other. Write it flatter.")
-
-    names = {x.get("name", ""): x for x in model if x.tag in ("link", "joint", "frame", "model")}
-    plugins += model.iterfind("plugin")
-    for link in model.iterfind("link"):
-        if (inertial := link.find("inertial")) is not None:
-            mass, *moments = (
-                _numbers(inertial.findtext(x), 1, str(path))[0] for x in ("mass", *(f"inertia/i{a}" for a in AXES))
-            )
-            name = link.get("name", "")
-            while name in links:  # of another model
-                name = f"other::{name}"
-            links[name] = mass, standing(link) @ own(inertial), symmetric(*moments)
-    for inner in model.iterfind("model"):
-        _add_sdf(inner, standing(inner), path, links, plugins, depth + 1)
-    for include in model.iterfind("include"):
-        name = include.findtext("uri", "").strip().removeprefix("model://")
-        beside = path.parent.parent / name
-        places = [beside / "model.sdf", beside / f"{name}.sdf", path.parent / f"{name}.sdf"]
-        file = next((x for x in places if re.fullmatch(r"[\w-]+", name) and x.is_file()), None)
-        inner = None if file is None else _xml(file).find("model")
-        if file is None or inner is None:
-            raise UserValueError(
-                f"{path} includes the model {shown(name)}: put it at {places[0]} or {places[-1]}, or take it out."
-            )
-        _add_sdf(inner, standing(include), file, links, plugins, depth + 1)
-
-
-def _body(links: Links, rotors: Sequence[str]) -> Found:
-    """All links as one rigid body, and where its rotors are from the centre of mass."""
-    mass = sum(m for m, _, _ in links.values())
-    centre = sum((m * frame[:3, 3] for m, frame, _ in links.values()), np.zeros(3)) / max(mass, 1e-9)
-    whole = np.zeros((3, 3))
-    for m, frame, inertia in links.values():
-        turn, arm = frame[:3, :3], frame[:3, 3] - centre
-        whole += turn @ inertia @ turn.T + m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    note = "all links together" if sum(m > 0.0 for m, _, _ in links.values()) > 1 else ""
-    found: Found = ({"mass": (mass, note)} if mass > 0.0 else {}) | diagonal(whole, note)
-    frames = np.array([links[x][1] for x in rotors]).reshape(-1, 4, 4).round(12)
-    return found | (placed((frames[:, :3, 3] - centre).round(12), frames[:, :3, 2]) if rotors else {})
-
-
-def _add_motors(found: Found, motors: Sequence[ET.Element], source: str) -> None:
-    """What the motors of Gazebo and RotorS say."""
-
-    def said(*names: str) -> tuple[Any, str]:
-        if any(x.find(name) is None for x in motors for name in names):
-            return None, ""
-        value, why = same([[_numbers(x.findtext(name), 1, source)[0] for name in names] for x in motors], names[0])
-        return (value if value is None or len(set(value)) > 1 else value[0]), why
-
-    if not motors:
-        return
-    turns = [(x.findtext("turningDirection") or "").strip() for x in motors]
-    if set(turns) <= {"cw", "ccw"}:
-        found["rotor_spin"] = [1 if x == "cw" else -1 for x in turns], "against turningDirection"
-    found["yaw_torque_coefficient"], found["rotor_speed_max"] = said("momentConstant"), said("maxRotVelocity")
-    found["motor_time_constant"], (k2, why) = said("timeConstantUp", "timeConstantDown"), said("motorConstant")
-    found["thrust_map"] = (None if k2 is None else [k2, 0.0, 0.0]), why
-    add_drag(found, said("rotorDragCoefficient")[0], None)
-
-
-def _add_attributes(found: Found, said: Said, name: str) -> None:
-    """What gym-pybullet-drones says of a drone, of rotors in rpm."""
-    force, torque, ratio = said("kf"), said("km"), said("thrust2weight")
-    mass, places = (found.get(x, (None,))[0] for x in ("mass", "rotor_positions"))
-    if places is not None and len(places) == 4:
-        spin = np.array([1, -1, 1, -1]) if name == "racer" else np.array([-1, 1, -1, 1])
-        found["rotor_spin"] = spin, "of the code of gym-pybullet-drones, not in the file"
-    if force is not None and force > 0.0:
-        found["thrust_map"] = [force / RPM**2, 0.0, 0.0], "kf"
-        if torque is not None:
-            found["yaw_torque_coefficient"] = torque / force, "km per kf"
-        if ratio is not None and mass and places is not None:
-            found["rotor_speed_max"] = (
-                speed_at(ratio * 9.81 * mass / len(places), found["thrust_map"][0]),
-                "of thrust2weight",
-            )
-        add_drag(found, said("drag_coeff_xy"), said("drag_coeff_z"))

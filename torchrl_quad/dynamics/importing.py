@@ -12,13 +12,25 @@ import torch
 
 from torchrl_quad.dynamics.control import FlightController
 from torchrl_quad.dynamics.gains import suggest_gains
-from torchrl_quad.dynamics.import_formats import MAPPINGS, READABLE, Array, Found, Said, read_json, read_xml
+from torchrl_quad.dynamics.import_formats import (
+    GIVEN,
+    MAPPINGS,
+    READABLE,
+    Array,
+    Found,
+    Said,
+    read_json,
+    speed_at,
+    usable,
+)
+from torchrl_quad.dynamics.import_models import read_xml
 from torchrl_quad.dynamics.parameters import FIELDS, QuadrotorParams, read_drone, read_fields
 from torchrl_quad.errors import UserValueError, one_line, shown
 
 CONVERT = {  # programs that write such files, and how to run them
     ".xacro": "Expand it first: xacro FILE.xacro > FILE.urdf.",
-    ".py": "Of RotorPy, write the parameters as JSON first: json.dump(quad_params, file, default=list).",
+    ".py": "Of RotorPy, write the parameters as JSON first: "
+    "json.dump(quad_params, file, default=lambda x: x.tolist()).",
 }
 ASKED = {  # what nobody can guess, as one could give it
     "mass": "0.5",
@@ -53,7 +65,7 @@ def load_drone(
             dtype is none of floating point. What a file of another project lacks is named all at once.
         FileNotFoundError: the path does not exist.
     """
-    source, kind, found, _ = _read(drone, entry)
+    source, kind, found, _ = _read(drone, entry, fields)
     found = _completed(source, kind, found, fields) if kind else found
     return read_drone({k: v for k, (v, _) in found.items()} | fields, dtype, source)
 
@@ -75,7 +87,7 @@ def import_drone(path: str | Path, *, entry: str | None = None, **fields: Any) -
         ValueError: it cannot be read, or lacks fields that are not given; all of them are named.
         FileNotFoundError: the path does not exist.
     """
-    source, kind, found, unread = _read(Path(path), entry)
+    source, kind, found, unread = _read(Path(path), entry, fields)
     if not kind:
         raise UserValueError(f"{source} is no file of another project. {READABLE}")
     found = _completed(source, kind, found, fields)
@@ -98,7 +110,7 @@ def _flow(value: Array) -> str:
 
 def _completed(source: str, kind: str, found: Found, fields: Mapping[str, Any]) -> Found:
     """What a file and a user say, and what is ours; an error names all that is missing."""
-    found = found | {k: (v, "given, not in the file") for k, v in fields.items()}
+    found = found | {k: (v, GIVEN) for k, v in fields.items()}
     if missing := [name for name in ASKED if found.get(name, (None,))[0] is None]:
         why = [f": {found[x][1]}" if x in found and found[x][1] else "" for x in missing]
         names = ", ".join(f"{x} [{FIELDS[x]['unit'] or '1'}]{y}" for x, y in zip(missing, why, strict=True))
@@ -141,11 +153,14 @@ def _examples(found: Found) -> dict[str, str]:
     heavy, fast = (
         float(np.max(x)) if isinstance(x, float | int | np.ndarray) else y for x, y in ((mass, 0.5), (speed, 1500.0))
     )
-    k2 = 3.0 * 9.81 * heavy / (n * max(fast, 1.0) ** 2)
-    return ASKED | {"rotor_spin": spin, "thrust_map": f"[{k2:.2g}, 0, 0]"}
+    force, curve = 3.0 * 9.81 * heavy / n, found.get("thrust_map", (None,))[0]
+    most = ASKED["rotor_speed_max"] if curve is None else f"{speed_at(force, curve):.4g}"
+    thrust = f"[{force / max(fast, 1.0) ** 2:.2g}, 0, 0]"
+    examples = ASKED | {"rotor_spin": spin, "thrust_map": thrust, "rotor_speed_max": most}
+    return {name: example.replace(" ", "") for name, example in examples.items()}  # one word of a command line
 
 
-def _read(drone: Any, entry: str | None) -> tuple[str, str, Found, list[str]]:
+def _read(drone: Any, entry: str | None, fields: Mapping[str, Any]) -> tuple[str, str, Found, list[str]]:
     """Of a drone: its source, the kind of file if it is no drone of ours, what it says, and what of it was not read."""
     suffix = Path(drone).suffix.lower() if isinstance(drone, str | Path) else ""
     if suffix in CONVERT:
@@ -153,7 +168,7 @@ def _read(drone: Any, entry: str | None) -> tuple[str, str, Found, list[str]]:
             f"{drone}: a {suffix} file has to be run before its numbers can be read. {CONVERT[suffix]}"
         )
     if suffix in (".urdf", ".sdf", ".xml", ".jinja"):
-        return read_xml(Path(drone))
+        return read_xml(Path(drone), usable(fields))
     if suffix == ".json":
         source, data = str(drone), read_json(Path(drone))
     elif isinstance(drone, Path) and suffix not in ("", ".yaml", ".yml", ".toml"):
@@ -176,6 +191,6 @@ def _read(drone: Any, entry: str | None) -> tuple[str, str, Found, list[str]]:
     if not drones:
         return source, "", {k: (v, "") for k, v in data.items()}, []
     kind, reader, part = drones[entry] if entry is not None else next(iter(drones.values()))
-    said = Said(part, source)
+    said = Said(part, source, usable(fields))
     found = reader(said)
     return source, kind, found, [str(key) for key in part if key not in said.asked]

@@ -180,7 +180,10 @@ def read_drone(values: Mapping, dtype: torch.dtype = torch.float32, source: str 
     places = _tensor("rotor_positions", given["rotor_positions"], like, source)
     fields = {name: _checked(name, x, like, source, places).to(torch.float64) for name, x in given.items()}
     command = None if motors is None else build(MotorCommand, f"{source}: motor_command", motors)
-    return QuadrotorParams(**fields, motor_command=command).to(dtype=dtype)
+    try:
+        return QuadrotorParams(**fields, motor_command=command).to(dtype=dtype)
+    except UserValueError as error:
+        raise UserValueError(str(error).replace("QuadrotorParams", source, 1)) from None
 
 
 def read_fields(drone: str | Path | Mapping) -> tuple[str, Mapping[str, Any]]:

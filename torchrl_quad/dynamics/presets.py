@@ -39,7 +39,7 @@ def read(kind: str, preset: str | Path | Mapping, folder: Traversable | None = N
     choices = f"Choose from: {', '.join(known)}; or give" if known else "Give"
     if isinstance(preset, str) and preset in known:
         source, path = f"{preset}.yaml", known[preset]
-    elif isinstance(preset, Path) or (isinstance(preset, str) and preset.endswith((".yaml", ".yml", ".toml"))):
+    elif isinstance(preset, Path) or (isinstance(preset, str) and preset.lower().endswith((".yaml", ".yml", ".toml"))):
         source, path = str(preset), Path(preset)
     else:
         raise UserValueError(f"Unknown {kind} {shown(preset)}. {choices} the path of a .yaml file, or a mapping.")
@@ -54,7 +54,7 @@ def read(kind: str, preset: str | Path | Mapping, folder: Traversable | None = N
 
 @functools.lru_cache(maxsize=64)  # each environment reads its drone again, and a file takes milliseconds
 def _parsed(content: bytes, source: str) -> Any:
-    return (parse_toml if source.endswith(".toml") else parse)(content, source)
+    return (parse_toml if source.lower().endswith(".toml") else parse)(content, source)
 
 
 def parse(content: bytes, source: str) -> Any:
@@ -84,7 +84,7 @@ def parse_toml(content: bytes, source: str) -> Any:
     try:
         if len(content) > MAX_BYTES:
             raise ValueError(f"it has more than {MAX_BYTES:,} bytes")
-        return tomllib.loads(content.decode())
+        return tomllib.loads(content.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise UserValueError(f"{source}: not a TOML file: {' '.join(str(error).split())}") from None
 
@@ -113,6 +113,7 @@ class _Loader(yaml.SafeLoader):
         found: dict[Hashable, Any] = {}
         for key, value in node.value:
             name = self.construct_object(key, deep=True) if isinstance(key, yaml.ScalarNode) else None
+            name = str(name) if isinstance(name, int) and not isinstance(name, bool) else name
             where = f"line {key.start_mark.line + 1} names"
             if not isinstance(name, str):
                 raise UserValueError(f"{where} a value by {shown(name)}, and a name must be a word.")

@@ -29,6 +29,8 @@ def own_format(source: str, values: Mapping[str, Any]) -> dict[str, Any]:
         UserValueError: what a file must say is missing, or not of the right form.
     """
     values = dict(values)
+    if isinstance(listed := values.pop("track_config", None), Mapping):  # of isaac_drone_racer
+        values |= listed
     gates = values.get("gates")
     by_name = gates if isinstance(gates, Mapping) else values
     named = {name: gate for name, gate in by_name.items() if isinstance(gate, Mapping)}
@@ -44,7 +46,8 @@ def own_format(source: str, values: Mapping[str, Any]) -> dict[str, Any]:
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         if isinstance(error, UserValueError):
             raise
-        raise UserValueError(f"{source}: cannot be read, {type(error).__name__}: {error}.") from error
+        why = f"it does not say {error}" if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"
+        raise UserValueError(f"{source}: cannot be read as a track of another project: {why}.") from error
     if isinstance(gates, Mapping):
         raise UserValueError(
             f"{source}: its gates have names, and {shown(gates)} is of no format that is known. Write gates as a list "
@@ -60,6 +63,8 @@ def agile_flight(source: str, values: dict[str, Any], gates: list[Mapping[str, A
     flown in the order of the gates, on the ways to it and from it together.
     """
     centres, rotations = (as_array([gate[key] for gate in gates]) for key in ("position", "rotation"))
+    if missing := [key for key in ("start_pos", "goal_pos") if key not in values]:
+        raise UserValueError(f"{source}: does not say {missing[0]}. Give load_track(..., {missing[0]}=[x, y, z]).")
     start, goal = as_array(values["start_pos"]), as_array(values["goal_pos"])
     is_lap = np.linalg.norm(goal - centres[0]) < np.linalg.norm(goal - centres[-1])
     path = np.vstack((start, centres, centres[:1] if is_lap else centres[-1:]))
@@ -97,13 +102,13 @@ def time_optimal(source: str, values: dict[str, Any]) -> dict[str, Any]:
         raise UserValueError(f"{source}: how near to a gate counts is not said. Give gate_radius [m].")
     own = {key: x for key, x in values.items() if key not in ("initial", "end", "ring")}
     points = as_array(values["gates"]).tolist()
-    if end := values.get("end", {}).get("position"):
+    if end := (values.get("end") or {}).get("position"):
         points.append(as_array(end).tolist())
     rounds = (k for k in range(2, len(points) // 2 + 1) if points[k:] == points[:-k])
     lap = next(rounds, None)
     closed = bool(values.get("ring", False)) or lap is not None
     notes = [f"the gates repeat: a lap of {lap}"] if lap else ["a ring" if closed else "no lap: end is the last gate"]
-    if start := values.get("initial", {}).get("position"):
+    if start := (values.get("initial") or {}).get("position"):
         own["start"] = as_array(start).tolist()
     return {"closed": closed, **own, "gates": points[:lap], "notes": [*notes, "only positions of the ends are read"]}
 
@@ -136,7 +141,7 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
     own |= {"position_jitter": spread.tolist()} if spread is not None else {}
     own |= {"rotation_jitter": drawn["gate_rpy"][1].tolist()} if "gate_rpy" in drawn else {}
     own["starts"] = [[*start[:2], max(start[2], box[0][2] + 0.25)], *before[1:]]
-    tops = as_array([pole["pos"] for pole in track["obstacles"]])
+    tops = as_array([pole["pos"] for pole in track.get("obstacles", [])]).reshape(-1, 3)
     middle, spread = drawn.get("obstacle_pos", (np.zeros(3), np.zeros(3)))
     low, high = (np.c_[tops[:, :2] + middle[:2] + sign * spread[:2], 0.0 * tops[:, 2]].tolist() for sign in (-1, 1))
     poles = [{"radius": LSY_POLE, "height": z} for z in tops[:, 2].tolist()]
@@ -162,12 +167,15 @@ def posed(centres: Any, rotations: Any) -> list[dict[str, Any]]:
 
 def _in_order(gates: Mapping[str, Mapping]) -> list[Mapping[str, Any]]:
     """Gates by the number in their name: Gate10 comes after Gate2."""
-    return [gates[name] for name in sorted(gates, key=lambda name: int(re.findall(r"\d+", name)[-1]))]
+    numbers = {name: re.findall(r"\d+", name) for name in gates}
+    if unnumbered := [name for name, found in numbers.items() if not found]:
+        raise UserValueError(f"The name of gate {shown(unnumbered[0])} has no number. Number them in order.")
+    return [gates[name] for name in sorted(gates, key=lambda name: int(numbers[name][-1]))]
 
 
 def _spread(source: str, spec: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     """The middle of what is drawn uniformly, and how far it goes to both sides."""
-    low, high = (as_array(spec["kwargs"][key]) for key in ("minval", "maxval"))
     if spec["fn"] != "uniform":
         raise UserValueError(f"{source}: what is drawn must be uniform; got {shown(spec['fn'])}.")
+    low, high = (as_array(spec["kwargs"][key]) for key in ("minval", "maxval"))
     return 0.5 * (low + high), 0.5 * (high - low)

@@ -1,0 +1,257 @@
+"""What URDF and SDF say of a drone: all their links are one rigid body."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_quad.dynamics import presets
+from torchrl_quad.dynamics.import_formats import (
+    AXES,
+    READABLE,
+    RPM,
+    Array,
+    Found,
+    Said,
+    add_drag,
+    diagonal,
+    placed,
+    read_text,
+    same,
+    speed_at,
+    symmetric,
+)
+from torchrl_quad.errors import UserValueError, one_line, shown
+
+DEPTH = 20  # of models, joints and frames within each other
+# Of each link: its mass, the frame of its centre of mass, its inertia there (NaN where nothing is said), and two
+# directions: of its z axis, and of the axis that it turns about.
+Links = dict[str, tuple[float, Array, Array, Array]]
+
+
+def read_xml(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
+    """Of a URDF or SDF: its path, its kind, what it says, and which of its attributes were not read."""
+    root, links, plugins = _xml(path), Links(), list[ET.Element]()
+    models = [root] if root.tag == "model" else [*root.iterfind("model"), *root.iterfind("world/model")]
+    if root.tag == "robot":
+        _add_urdf(root, links, str(path))
+        plugins += root.iter("plugin")
+    elif models:
+        _add_sdf(models[0], np.eye(4), path, links, plugins)
+    else:
+        raise UserValueError(
+            f"{path}: XML with the root <{one_line(root.tag)}> is no URDF or SDF with a model. {READABLE}"
+        )
+    if any("liftdrag" in re.sub(r"\W|_", "", x.get("filename", "").lower()) for x in plugins):
+        raise UserValueError(f"{path}: it has wings (LiftDrag), and a drone here has rotors alone. Take a multicopter.")
+    motors = sorted(
+        (x for x in plugins if x.find("motorConstant") is not None), key=lambda x: _digits(x.findtext("motorNumber"))
+    )
+    short = {re.split("/|::", name)[-1]: name for name in links}
+    rotors = [short.get(re.split("/|::", (x.findtext("linkName") or "").strip())[-1], "") for x in motors]
+    for word in ("rotor", "prop", "motor"):
+        named = rf"(?<!quad)(?<!hexa)(?<!octo){word}(?!\D*guard)\D*\d+"
+        rotors = rotors or sorted((x for x in links if re.search(named, x.lower())), key=_digits)
+    if "" in rotors:
+        raise UserValueError(f"{path}: the linkName of a motor is that of no link with an <inertial>. Add it.")
+    found = _body(links, rotors, bool(motors)) | given
+    _add_motors(found, motors, str(path), given)
+    if (said := root.find("properties")) is not None and root.tag == "robot":
+        values = {name: presets.parse(text.encode(), name) for name, text in said.attrib.items()}
+        numbers = Said(values, str(path), given)
+        _add_attributes(found, numbers, root.get("name", ""))
+        return str(path), "URDF of gym-pybullet-drones", found, [x for x in said.attrib if x not in numbers.asked]
+    return str(path), "URDF" if root.tag == "robot" else "SDF", found, []
+
+
+def _digits(name: str | None) -> list[int]:
+    return [int(x) for x in re.findall(r"\d+", name or "")]
+
+
+def _xml(path: Path) -> ET.Element:
+    text = read_text(path)
+    text = text[max(text.find("<?xml"), 0) :]  # before which Gazebo allows comments
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # a few lines of which can mean billions of characters
+        raise UserValueError(f"{path}: it declares entities or a type. Write the values out instead.")
+    try:
+        return ET.fromstring(text)
+    except (ET.ParseError, ValueError) as error:
+        raise UserValueError(f"{path}: not an XML file: {one_line(error)}.") from None
+
+
+def _numbers(text: str | None, n: int, source: str) -> Array:
+    """So many numbers; zeros where there is nothing."""
+    try:
+        values = np.array((text or "").split() or [0.0] * n, float)
+    except ValueError:
+        values = np.empty(0)
+    if len(values) != n:
+        raise UserValueError(f"{source}: expected {n} number{'s' * (n > 1)}, got {shown(text)}.")
+    return values
+
+
+def _frame(xyz: Array, rpy: Array) -> Array:
+    """Where something stands in what holds it, (4, 4): turned about x, then y, then z."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    about = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]) @ np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = about @ np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]]), xyz
+    return frame
+
+
+def _add_urdf(root: ET.Element, links: Links, source: str) -> None:
+    def origin(element: ET.Element) -> Array:
+        found = element.find("origin")
+        return np.eye(4) if found is None else _frame(*(_numbers(found.get(x), 3, source) for x in ("xyz", "rpy")))
+
+    def end(joint: ET.Element, name: str) -> str:
+        return getattr(joint.find(name), "attrib", {}).get("link", "")
+
+    joints = {end(joint, "child"): joint for joint in root.iterfind("joint")}
+    for link in root.iterfind("link"):
+        name, frame = link.get("name", ""), np.eye(4)
+        if (inertial := link.find("inertial")) is None:
+            continue
+        above = name
+        for _ in range(DEPTH):  # up to the root; no further where they make a circle
+            if above in joints:
+                frame, above = origin(joints[above]) @ frame, end(joints[above], "parent")
+        about = {x.tag: x.attrib for x in inertial}
+        mass, *moments = (
+            _numbers(about.get(tag, {}).get(name), 1, source)[0]
+            for tag, name in (("mass", "value"), *(("inertia", f"i{axes}") for axes in AXES))
+        )
+        axis = joints[name].find("axis") if name in joints and joints[name].get("type") != "fixed" else None
+        turns = np.array([0.0, 0.0, 1.0]) if axis is None else _numbers(axis.get("xyz"), 3, source)
+        turns = frame[:3, :3] @ turns * (1.0 if axis is None or (frame[:3, :3] @ turns)[2] >= 0.0 else -1.0)
+        inertia = symmetric(*moments) if "inertia" in about else np.full((3, 3), np.nan)
+        links[name] = mass, frame @ origin(inertial), inertia, np.stack((frame[:3, 2], turns))
+
+
+def _add_sdf(
+    model: ET.Element, outer: Array, path: Path, links: Links, plugins: list[ET.Element], depth: int = 0
+) -> dict[str, Array]:
+    """Add the links and plugins of a model and of those within it, in the frame of the outermost; what stands where."""
+
+    def own(element: ET.Element) -> Array:
+        pose = _numbers(element.findtext("pose"), 6, str(path))
+        in_degrees = any(x.get("degrees") in ("true", "1") for x in element.iterfind("pose"))
+        return _frame(pose[:3], np.radians(pose[3:]) if in_degrees else pose[3:])
+
+    def standing(element: ET.Element, steps: int = 0) -> Array:
+        pose, child = element.find("pose"), element.findtext("child", "").strip() if element.tag == "joint" else ""
+        base = ("" if pose is None else pose.get("relative_to", "")) or element.get("attached_to", "") or child
+        if base in names and steps < DEPTH:
+            return standing(names[base], steps + 1) @ own(element)
+        if base not in ("", "__model__", "world", *names, *inside):
+            raise UserValueError(
+                f"{path}: a pose is relative to {shown(base)}, which is no link, joint, frame or model."
+            )
+        return inside.get(base, outer) @ own(element)
+
+    if depth > DEPTH:
+        raise UserValueError(f"{path}: more than {DEPTH} models lie within each other. Write it flatter.")
+
+    names = {x.get("name", ""): x for x in model if x.tag in ("link", "joint", "frame", "model")}
+    inside = dict[str, Array]()  # what the models within have
+    plugins += model.iterfind("plugin")
+    for inner in (x for x in model if x.tag in ("model", "include")):
+        file, said, place = path, inner, standing(inner)
+        if inner.tag == "include":
+            file, said = _included(path, inner.findtext("uri", ""))
+            place = place if inner.find("pose") is not None else place @ own(said)
+        found = _add_sdf(said, place, file, links, plugins, depth + 1)
+        name = inner.findtext("name") or said.get("name", "")
+        inside |= found if inner.get("merge") in ("true", "1") else {f"{name}::{k}": x for k, x in found.items()}
+        inside[name] = place
+    for link in model.iterfind("link"):
+        if (inertial := link.find("inertial")) is not None:
+            mass, *moments = (
+                _numbers(inertial.findtext(x), 1, str(path))[0] for x in ("mass", *(f"inertia/i{a}" for a in AXES))
+            )
+            name, frame = link.get("name", ""), standing(link)
+            while name in links:  # of another model
+                name = f"other::{name}"
+            inertia = symmetric(*moments) if inertial.find("inertia") is not None else np.full((3, 3), np.nan)
+            links[name] = mass, frame @ own(inertial), inertia, frame[:3, [2, 2]].T
+    return inside | {x: standing(names[x]) for x in names if names[x].tag == "link"}
+
+
+def _included(path: Path, uri: str) -> tuple[Path, ET.Element]:
+    """The file and the model that a model includes, which lie beside it."""
+    name = re.sub(r"/(model\.sdf|\d+)?$", "", uri.strip()).rsplit("/", 1)[-1]
+    beside = path.parent.parent / name
+    places = [beside / "model.sdf", beside / f"{name}.sdf", path.parent / f"{name}.sdf"]
+    file = next((x for x in places if re.fullmatch(r"(?!\.)[\w. -]+", name) and x.is_file()), None)
+    if file is None or (inner := _xml(file).find("model")) is None:
+        raise UserValueError(
+            f"{path} includes the model {shown(uri.strip())}: put it at {places[0]} or {places[-1]}, or take it out."
+        )
+    return file, inner
+
+
+def _body(links: Links, rotors: Sequence[str], by_motors: bool) -> Found:
+    """All links as one rigid body, and where its rotors are from the centre of mass."""
+    mass = sum(m for m, *_ in links.values())
+    centre = sum((m * frame[:3, 3] for m, frame, *_ in links.values()), np.zeros(3)) / max(mass, 1e-9)
+    whole = np.zeros((3, 3))
+    for m, frame, inertia, _ in links.values():
+        turn, arm = frame[:3, :3], frame[:3, 3] - centre
+        whole += turn @ np.nan_to_num(inertia) @ turn.T + m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    note = "all links together" if sum(m > 0.0 for m, *_ in links.values()) > 1 else ""
+    found: Found = ({"mass": (mass, note)} if mass > 0.0 else {}) | diagonal(whole, note)
+    points = [x for x, (m, _, inertia, _) in links.items() if np.isnan(inertia).any() and m > 0.2 * mass]
+    if points:
+        found["inertia"] = None, f"the link {shown(points[0])} has a mass and no <inertia>"
+    if not rotors:
+        why = "relative to the centre of mass; no link with an <inertial> is named rotor, prop or motor with a number"
+        return found | {"rotor_positions": (None, why)}
+    frames = np.array([links[x][1] for x in rotors]).round(12)
+    up = np.array([links[x][3][0 if by_motors else 1] for x in rotors]).round(12)  # a motor pushes along the link's z
+    return found | placed((frames[:, :3, 3] - centre).round(12), up, note=f"of {', '.join(rotors)}")
+
+
+def _add_motors(found: Found, motors: Sequence[ET.Element], source: str, given: Found) -> None:
+    """What the motors of Gazebo and RotorS say."""
+
+    def said(*names: str) -> tuple[Any, str]:
+        if any(x.find(name) is None for x in motors for name in names):
+            return None, ""
+        value, why = same([[_numbers(x.findtext(name), 1, source)[0] for name in names] for x in motors], names[0])
+        return (value if value is None or len(set(value)) > 1 else value[0]), why
+
+    if not motors:
+        return
+    turns = [(x.findtext("turningDirection") or "").strip().lower() for x in motors]
+    if set(turns) <= {"cw", "ccw"}:
+        found["rotor_spin"] = [1 if x == "cw" else -1 for x in turns], "against turningDirection"
+    found["yaw_torque_coefficient"], found["rotor_speed_max"] = said("momentConstant"), said("maxRotVelocity")
+    found["motor_time_constant"], (k2, why) = said("timeConstantUp", "timeConstantDown"), said("motorConstant")
+    found["thrust_map"] = (None if k2 is None else [k2, 0.0, 0.0]), why
+    found |= given
+    add_drag(found, said("rotorDragCoefficient")[0], None)
+
+
+def _add_attributes(found: Found, said: Said, name: str) -> None:
+    """What gym-pybullet-drones says of a drone, of rotors in rpm."""
+    force, torque, ratio = said("kf"), said("km"), said("thrust2weight")
+    mass, places = (found.get(x, (None,))[0] for x in ("mass", "rotor_positions"))
+    if places is not None and len(places) == 4:
+        spin = np.array([1, -1, 1, -1]) if name == "racer" else np.array([-1, 1, -1, 1])
+        found["rotor_spin"] = spin, "of the code of gym-pybullet-drones, not in the file"
+    if force is not None and force > 0.0:
+        found["thrust_map"] = [force / RPM**2, 0.0, 0.0], "kf"
+        if torque is not None:
+            found["yaw_torque_coefficient"] = torque / force, "km per kf"
+        if ratio is not None and mass and places is not None:
+            found["rotor_speed_max"] = (
+                speed_at(ratio * 9.81 * mass / len(places), found["thrust_map"][0]),
+                "of thrust2weight",
+            )
+        found |= said.given
+        add_drag(found, said("drag_coeff_xy"), said("drag_coeff_z"))

@@ -20,7 +20,7 @@ def main(cfg: DictConfig) -> None:
     columns = settings["columns"]
     if isinstance(columns, dict):  # a mapping for Columns: {names: [ax, ay, az], scale: 9.80665}
         columns = {name: Columns(**x) if isinstance(x, dict) else x for name, x in columns.items()}
-    logs = [read_log(path, columns, convention=convention) for path in cfg.logs]
+    logs = [read_log(path, columns, convention=convention, **(settings["reading"] or {})) for path in cfg.logs]
     for log in logs:
         print(log)
     known = dict(settings["known"] or {}) | ({} if cfg.mass is None else {"mass": cfg.mass})

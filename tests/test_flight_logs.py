@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from log_writers import END, OURS, TABLE, G, flight, matrix, own_table, write_csv
-from refusals import refuses
+from refusals import cases, refuses
 
 from torchrl_quad.errors import UserError, UserValueError
 from torchrl_quad.identification import LAYOUTS, Columns, LogError, MissingColumns, NoFlight, read_log
@@ -82,6 +82,16 @@ def test_a_real_flight_is_read_in_our_units_frames_and_orders(table):
     assert higher[0] > start and higher[1] < stop
 
 
+def turned(table, x, y):
+    """Position and velocity in another world than the attitude."""
+    pairs = [(a, (f"{a}x", f"{a}y")) for a in "pv"]
+    return {
+        f"{a}{n}": np.array(row) @ [table[k] for k in names]
+        for a, names in pairs
+        for n, row in zip("xy", (x, y), strict=True)
+    }
+
+
 FAULTS = {  # a fault: what changes, the error, and what its message must name
     "gyro in degrees": (lambda t: scaled(t, GYRO, 180 / np.pi), "WrongUnit", "imu_gyro_x.*degrees/s. Write .*0.0174"),
     "gyro in milliradians": (lambda t: scaled(t, GYRO, 1e3), "WrongUnit", "imu_gyro_x.*milliradians"),
@@ -128,6 +138,34 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
         "WrongUnit",
         "imu_gyro_x.*imu_acc_x",
     ),
+    "roll rate mirrored": (lambda t: scaled(t, GYRO[:1], -1), "WrongFrame", "with roll the other way. Write .*-1.0, 1"),
+    "pitch rate mirrored": (lambda t: scaled(t, GYRO[1:2], -1), "WrongFrame", "with pitch the other way. Write "),
+    "centimetres": (lambda t: scaled(t, PLACE + SPEED, 1e2), "WrongUnit", "px.*centimetres.*0.01.*vx.*0.01"),
+    "feet": (lambda t: scaled(t, PLACE + SPEED, 1 / 0.3048), "WrongUnit", "leans less than .*in feet.*0.3048"),
+    "knots": (lambda t: scaled(t, SPEED, 1 / 0.5144), "WrongUnit", "1.9.* times .*in knots, write .*0.5144"),
+    "km/h": (lambda t: scaled(t, SPEED, 3.6), "WrongUnit", "3.* times .*in km/h, write .*0.277"),
+    "millivolts": (lambda t: {"pwr_pm_vbat": 1e3 * t["pwr_pm_vbat"]}, "WrongUnit", "in the median.*millivolts, write"),
+    "motors in pulses": (
+        lambda t: {n: np.where(t["t"] < 0.5, 0.0, 1000.0 + t[n] / 65.535) * 65535.0 for n in MOTORS},
+        "WrongUnit",
+        "runs from 0 .*pulses from 1000 to 2000 us, write",
+    ),
+    "world turned": (lambda t: turned(t, (0.0, -1.0), (1.0, 0.0)), "WrongFrame", "turned by 8. degrees about z. Bring"),
+    "world mirrored": (
+        lambda t: turned(t, (1.0, 0.0), (0.0, -1.0)),
+        "WrongFrame",
+        "of position and .* is mirrored in y",
+    ),
+    "y up": (
+        lambda t: {n: f * t[k] for a in "pv" for n, k, f in ((f"{a}y", f"{a}z", 1.0), (f"{a}z", f"{a}y", -1.0))},
+        "WrongFrame",
+        "leans another way .* Name columns of one world, with z up",
+    ),
+    "attitude of another time": (
+        lambda t: {n: np.roll(t[n], 150) for n in TURN + GYRO},
+        "WrongFrame",
+        "leans another way .*up to 0.3 s late. Name",
+    ),
     "clock in ms": (lambda t: scaled(t, ["t"], 1e3), "WrongUnit", "milliseconds, write"),
     "clock in ns": (lambda t: {"t": 1e9 * t["t"]}, "WrongUnit", "nanoseconds, write"),
     "clock jumps back": (lambda t: {"t": t["t"] - (t["t"] > 5.0)}, "ClockJumpsBack", "from 5 to 4.0.* at sample"),
@@ -140,6 +178,7 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
 
 HOPELESS = {"motors beyond full", "motors are thrusts", "motors hardly run", "motors turn to and fro", "no numbers"}
 HOPELESS |= {"clock jumps back", "motors off", "never in the air"}
+HOPELESS |= {"world turned", "world mirrored", "y up", "attitude of another time"}
 
 
 def test_a_tracker_that_jumps_is_cut_out(table, read):
@@ -167,6 +206,31 @@ def test_each_fault_has_its_name_and_its_remedy(fault, table, plain, read):
             for name in ("angular_velocity", "acceleration", "position", "velocity", *motors):
                 np.testing.assert_allclose(getattr(mended, name), getattr(plain, name), atol=1e-3, err_msg=name)
     assert bool(told) == (fault not in HOPELESS)
+
+
+@cases(
+    (lambda head, rows: [head, *(",".join(f'"{x}"' for x in row.split(",")) for row in rows)], None),
+    (lambda head, rows: [head, *rows[:-1], rows[-1][:40]], "is cut off: left out"),
+    (lambda head, rows: ["sep=;", *(x.replace(",", ";") for x in (head, *rows))], None),
+    (lambda head, rows: [x.replace(",", "|") for x in (head, *rows)], None),
+    (lambda head, rows: [head, *(f"{row}," for row in rows)], None),
+    (lambda head, rows: rows, "its first row holds numbers. Put a row above it"),
+    (lambda head, rows: ["made by a program", head, *rows], "first row names the columns: delete the lines above"),
+    (lambda head, rows: [head, *(f"12:00:{row}" for row in rows)], "the time in t is no number, but '12:00:0"),
+    (lambda head, rows: [head, *rows[:5], rows[5][:40], *rows[5:]], "row 6 has"),
+)
+def test_tables_as_other_programs_write_them_are_read_or_their_lines_are_named(change, said, table, plain, tmp_path):
+    path = write_csv(tmp_path / "flight.csv", table)
+    head, *rows = path.read_text().splitlines()
+    path.write_text("\n".join(change(head, rows)) + "\n")
+    if said is None or "left out" in said:
+        log = read_log(path)
+        np.testing.assert_allclose(log.position, plain.position[: len(log.position)])
+        assert (said or "") in str(log) and len(log.time) > len(plain.time) - 3
+    else:
+        refuses(said, read_log, path, error=UnreadableLog)
+    path.write_bytes(path.read_text().encode("utf-16"))
+    refuses("is text, but not in UTF-8. Save it as CSV in UTF-8", read_log, path, error=UnreadableLog)
 
 
 def test_without_a_gyro_the_lean_of_the_drone_tells_a_wrong_quaternion(table, plain, read):

@@ -243,6 +243,8 @@ def test_what_contradicts_the_drone_is_found_and_no_inertia_is_one_that_no_body_
     refuses(turned, identify, short, "crazyflie", {"rotor_spin": [-1, 1, -1, 1]}, **options)
     heavy = r"left over .*mass of 0.06 kg or its thrust.*name \"thrust_map\" in fields"
     refuses(heavy, identify, short, "crazyflie", {"mass": 0.06}, iterations=1, **options)
+    large = dataclasses.replace(short, battery_voltage=10.0 * real.battery_voltage)
+    refuses("a battery has 3.* V in the mean, and the drone's motor_command is for", identify, large, **options)
     result = identify(short, iterations=1, **options)
     assert max(map(abs, result.trim["force_per_weight"])) < 0.1 and set(result.errors_by_flight) == {"figure8"}
     worse = {**result.errors, "fitted": {name: {0.2: 9.0} for name in result.errors["fitted"]}}
@@ -283,7 +285,7 @@ def test_a_checkpoint_that_is_damaged_is_refused_and_named(real, tmp_path):
 @pytest.mark.usefixtures("rough")
 def test_the_recipe_fits_a_real_flight_and_draws_it(launch, refused, tmp_path):
     (tmp_path / "own.csv").write_text(gzip.decompress(REAL.read_bytes()).decode().replace("pwr_pm_vbat", "volts"))
-    own = ["columns={battery_voltage: {names: [volts], scale: 1.0}}", "convention=crazyflie"]
+    own = ["columns={battery_voltage: {names: [volts], scale: 1.0}}", "convention=crazyflie", "reading={max_gap: 0.2}"]
     arguments = [f"logs=[{tmp_path}/own.csv]", *own, "mass=0.027", "fields=[linear_drag]", "iterations=1", "draws=5"]
     assert "linear_drag.xy" in launch("identify", *arguments, f"folder={tmp_path}/fit")
     names = "checkpoint.json drone.yaml prediction.png randomization.yaml report.json residuals.png"

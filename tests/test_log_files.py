@@ -16,7 +16,7 @@ from log_writers import END, SERVOS, TABLE, ULOG, dataflash_messages, flight, ma
 from log_writers import ulog_message, usd_events, write_csv, write_dataflash, write_ulog, write_usd  # isort: skip
 from refusals import refuses
 
-from torchrl_quad.identification import GapsTooLarge, LogError, MissingColumns, read_log, sources
+from torchrl_quad.identification import Columns, GapsTooLarge, LogError, MissingColumns, read_log, sources
 from torchrl_quad.identification.autopilots import decompress_quaternions, read_ulog
 from torchrl_quad.identification.errors import NoFlight, UnreadableLog, WrongMotors, WrongUnit
 
@@ -215,7 +215,7 @@ def write_bag(path, ros2, storage="MCAP", twin=None, stamped=1_700_000_000, spee
     return path
 
 
-def test_bags_of_ros_1_and_2_find_topics_by_their_types(tmp_path):
+def test_bags_of_ros_1_and_2_find_topics_by_their_types(tmp_path, monkeypatch):
     log = read_log(write_bag(tmp_path / "flight.bag", ros2=False), BATTERY)
     same(log)
     assert log.onboard == ("angular_velocity", "acceleration", "motor_command", "battery_voltage")
@@ -234,6 +234,12 @@ def test_bags_of_ros_1_and_2_find_topics_by_their_types(tmp_path):
         ({"battery_voltage": "/drone/battery.voltage"}, "lacks a field of .*Its messages have: x, y, z"),
     ):
         refuses(message, read_log, file, columns, error=MissingColumns)
+    with monkeypatch.context() as patch:  # a remedy for the position leaves the attitude of its topic
+        true = flight
+        patch.setattr("test_log_files.flight", lambda t: true(t) | {"position": 1e3 * true(t)["position"]})
+        long = write_bag(tmp_path / "long.bag", ros2=False)
+    said = refuses("in millimetres", read_log, long, BATTERY, error=WrongUnit)
+    same(read_log(long, **eval(f"dict({said.partition('write ')[2][:-1]})", {"Columns": Columns})), velocity=2e-2)
     twins = write_bag(tmp_path / "twins.bag", ros2=False, twin="imu", share=0.1)
     with pytest.raises(MissingColumns, match="several topics for angular_velocity: /drone/imu, /drone/imu2. Say which"):
         read_log(twins, BATTERY)

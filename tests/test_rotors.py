@@ -1,6 +1,8 @@
 """Any number and place of rotors, and rotors that fail."""
 
+import dataclasses
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 import torch
 import yaml
 from flying import fly, hold
+from log_writers import END, TABLE, flight, ned, own_table, write_csv
 from refusals import cases, refuses
 from tensordict import TensorDict
 
@@ -18,7 +21,8 @@ from torchrl_quad.deploy import contract, frames
 from torchrl_quad.deploy.simulators import make_simulator, special
 from torchrl_quad.dynamics import FlightController, Quadrotor
 from torchrl_quad.envs import Disturbance
-from torchrl_quad.identification import prediction_error, read_log
+from torchrl_quad.identification import Columns, prediction_error, read_log
+from torchrl_quad.identification.errors import WrongMotors
 from torchrl_quad.identification.prediction import log_columns
 
 F64 = torch.float64
@@ -304,3 +308,22 @@ def test_the_motors_of_an_autopilot_and_of_a_log_belong_to_rotors_by_their_place
     assert errors[0] == pytest.approx(errors[1], rel=1e-9)
     for call in (lambda: frames.px4().of(LAYOUTS["plus"]["rotor_positions"]), lambda: log_columns(drone("hexarotor"))):
         refuses("of an X.* has rotors at ", call)
+
+
+def test_a_plus_is_told_from_an_x_and_the_remedy_for_a_log_in_ned_keeps_the_order_of_its_quaternions(tmp_path):
+    t = np.arange(0.0, END, 0.01)
+    axes = np.array([[0.0, 1.5, 0.0, -1.5], [-1.5, 0.0, 1.5, 0.0], [1.0, -1.0, 1.0, -1.0]])
+    true, on = flight(t), ((t > 0.7) & (t < 9.3))[:, None]
+    spun = np.gradient(true["angular_velocity"], t, axis=0)
+    thrust = np.square(true["motor_command"]).mean(1, keepdims=True) + 0.004 * np.clip(spun, -20.0, 20.0) @ axes
+    path = write_csv(tmp_path / "plus.csv", own_table(t, motor_command=on * np.sqrt(np.clip(thrust, 0.01, 1.0))))
+    refuses("as rotors in front, left, behind and right do", read_log, path, TABLE, error=WrongMotors)
+    down = ned(flight(t))
+    path = write_csv(tmp_path / "ned.csv", own_table(t, **down))
+    mapping = TABLE | {"quaternion": [*TABLE["quaternion"][1:], TABLE["quaternion"][0]]}
+    said = refuses("all of the log is in NED", read_log, path, mapping, convention=frames.crazyflie(), error=ValueError)
+    told = re.search(r"rite (.*)\.$", said)[1]
+    given = eval(f"dict({told})", {"Columns": Columns, "np": np, "frames": frames, "dataclasses": dataclasses})
+    log = read_log(path, **{"columns": mapping, **given})
+    k = slice(*log.segments[0])
+    assert np.abs((log.quaternion * flight(log.time)["quaternion"]).sum(-1))[k].min() > 0.999

@@ -13,7 +13,18 @@ import numpy as np
 
 from torchrl_quad.errors import UserError, one_line
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog, WrongMotors
-from torchrl_quad.identification.layouts import BY_IMU, RIVALS, ROS, Asked, Layout, choose, listed, named_alike, shipped
+from torchrl_quad.identification.layouts import (
+    BY_IMU,
+    RIVALS,
+    ROS,
+    Asked,
+    Columns,
+    Layout,
+    choose,
+    listed,
+    named_alike,
+    shipped,
+)
 from torchrl_quad.identification.signals import Array, Stream, open_plain
 
 LIKELY = ("pose", "odometry", "imu", "motors", "actuators", "battery")
@@ -100,9 +111,11 @@ def _layout(bag: Any, topics: Mapping[str, str], columns: Asked, name: str) -> L
     if columns is not None and not isinstance(columns, Mapping):
         return choose(columns, None)
     given = columns or {}
-    named = set(given)
-    if named & {"position", "quaternion"}:  # the caller means the pose of that topic only
-        named |= {"position", "quaternion", "velocity_body"}
+    named, pose = set(given), {"position", "quaternion", "velocity_body"}
+    places = [name for x in pose & named for name in _names(given[x])]
+    of = {topic for topic in topics if any(place.startswith(f"{topic}.") for place in places)}
+    if places and not of:
+        named |= pose
     named |= {second for first, second in RIVALS if first in named}
     rivals = {second: first for first, second in RIVALS}
     found, onboard = {}, BY_IMU
@@ -110,6 +123,8 @@ def _layout(bag: Any, topics: Mapping[str, str], columns: Asked, name: str) -> L
         topics_of_kind = sorted(topic for topic in topics if topics[topic] == kind)
         for quantity, fields in quantities.items():
             own, rival = topics_of_kind, rivals.get(quantity)
+            if of and quantity in pose:  # the caller means the pose of that topic only
+                own = [topic for topic in own if topic in of]
             if kind.endswith("/Actuators"):  # whose messages hold commands, or speeds
                 own = [topic for topic in own if _length(bag, topic, fields["of"], name)]
             if not own or {quantity, rival} & named or quantity in found or (rival in found and rival != "velocity"):
@@ -126,6 +141,12 @@ def _layout(bag: Any, topics: Mapping[str, str], columns: Asked, name: str) -> L
     if not found and not given:
         raise MissingColumns(f"{name} has no topic of a known type. {_there(topics)}")
     return choose(given, Layout(found, ROS, onboard))
+
+
+def _names(columns: Any) -> list[str]:
+    """The columns that a caller names for a quantity."""
+    names = columns.names if isinstance(columns, Columns) else columns
+    return [names] if isinstance(names, str) else [str(name) for name in names or ()]
 
 
 def _length(bag: Any, topic: str, field: str, name: str) -> int:

@@ -17,6 +17,7 @@ from torchrl_quad.rotations import rotate, rotate_inverse
 
 MAX_LAG = 0.3  # [s] between streams
 CALM = 0.1  # [rad/s]: slower rotations are lost in the noise of motion capture
+LEAN = 0.05 * G  # [m/s^2]: what accelerates less may do so by the wind
 SURE = 0.05  # how much better a hypothesis must correlate than the log as it is given
 FRD = np.array([1.0, -1.0, -1.0])
 _CONJUGATE = (1.0, -1.0, -1.0, -1.0)
@@ -37,6 +38,8 @@ _COMMANDS = (  # factor, offset, least, largest, and what they are
     (1.0 / 65535.0, 0.0, 0.0, 65535.5, "counts of 16 bits"),
 )
 _X = np.array([[1, 1, -1, -1], [-1, 1, 1, -1], [1, -1, 1, -1]])  # roll, pitch, yaw by our motors, yaw either way
+_PLUS = np.array([[0, 1, 0, -1], [-1, 0, 1, 0], [1, -1, 1, -1]])  # of rotors in front, left, behind and right
+_AXES = ("roll", "pitch", "yaw")
 _ORDERS = list(itertools.permutations(range(4)))
 
 
@@ -45,7 +48,7 @@ def check_motors(signal: Signal) -> list[str]:
     low, high = float(signal.values.min()), float(signal.values.max())
     full = float(np.percentile(signal.values.mean(-1), 95))
     below = signal.values < -0.01
-    if -0.5 < low < -0.01 and high <= 1.01 and np.ptp(signal.values[below]) < 1e-3 and full > LEAST_HOVER:
+    if -1.01 < low < -0.01 and high <= 1.01 and np.ptp(signal.values[below]) < 1e-3 and full > LEAST_HOVER:
         return [f"{signal} is {low:.3g} in {below.mean():.0%} of its samples, as where motors are disarmed: taken as 0"]
     if low >= -0.01 and high <= 1.01:
         if OFF < full < LEAST_HOVER:
@@ -54,10 +57,11 @@ def check_motors(signal: Signal) -> list[str]:
                 "so little of it. Name the commands, or say by Columns(names, scale=...) what is full."
             )
         return [f"{signal} reaches {low:.3f} to {high:.3f}: clipped to 0 to 1"] if low < 0.0 or high > 1.0 else []
+    begun = float(signal.values.min(where=signal.values > 0.0, initial=high))  # some are 0 until they are armed
     remedies = [
         {"quantity": signal.field, "factor": factor, "offset": offset, "when": f"they are {what}"}
         for factor, offset, least, most, what in _COMMANDS
-        if least <= low and high <= most and (full - offset) * factor > 4.0 * LEAST_HOVER
+        if least <= (begun if low == 0.0 else low) and high <= most and (full - offset) * factor > 4.0 * LEAST_HOVER
     ]
     if _turn_one_way(signal.values) and np.abs(signal.values).max() > 50.0:
         remedies.append({"quantity": signal.field, "name": "rotor_speed", "when": "they are rotor speeds in rad/s"})
@@ -105,6 +109,15 @@ def check_quaternion(signal: Signal) -> list[str]:
     return [f"{off.sum()} samples of {signal} are not of length 1; they count as missing"] if off.any() else []
 
 
+def check_voltage(signal: Signal) -> None:
+    """Refuse the voltage of a battery in other units."""
+    usual = float(np.median(signal.values[signal.values > 0.0]))
+    if usual > 100.0:
+        said = f"{signal} is {usual:.4g} in the median, and is in V."
+        drop: Remedy = {"quantity": signal.field, "drop": True, "when": "it is no voltage"}
+        raise WrongUnit(said, *in_units(signal.field, "it is in", millivolts=1e-3, centivolts=1e-2), drop)
+
+
 def check_velocity(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float, moving: Mask) -> None:
     """Refuse a position or velocity in other units, and a velocity that is not the derivative of the position."""
     derived = smooth(slope(at["position"], dt), dt)
@@ -118,10 +131,12 @@ def check_velocity(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: f
         return
     given = smooth(at["velocity"], dt)
     fit, factor, _ = _compare(given, derived, dt, moving)
-    if not 0.5 < factor < 2.0:
+    if not 0.6 < factor < 1.6:
         size = "position" if factor < 1.0 else "velocity"
         ratio = min(factor, 1.0 / factor)
         lengths = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
+        lengths |= {"km/h": 1 / 3.6, "knots": 0.5144} if size == "velocity" else {}
+        lengths = dict(sorted(lengths.items(), key=lambda item: abs(np.log(ratio / item[1]))))
         raise WrongUnit(
             f"{signal} is {factor:.3g} times the derivative of {place}: they, or the clock, are in different units.",
             *in_units(size, f"the {size} is in", **{k: x for k, x in lengths.items() if 0.8 < ratio / x < 1.25}),
@@ -194,6 +209,8 @@ def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: floa
         return calm
     trials = {name: (smooth(body_rates(h, dt), dt), smooth(gyro, dt)) for name, h in hypotheses.items()}
     trials["body y right, z down"] = (right, smooth(gyro * FRD, dt))
+    for k, axis in enumerate(_AXES):
+        trials[f"with {axis} the other way"] = right, smooth(gyro * np.where(np.arange(3) == k, -1.0, 1.0), dt)
     trials["in the world frame"] = (right, smooth(rotate_inverse(q, gyro), dt))
     fits = {name: _compare(b, a, dt, moving) for name, (a, b) in trials.items()}
     fit, factor, lag = fits["as given"]
@@ -207,6 +224,9 @@ def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: floa
             )
         if best == "in the world frame":
             raise WrongFrame(f"{told} if the gyro is in the world frame.", {"quantity": signal.field, "drop": True})
+        if " the other way" in best:
+            flip = {"quantity": signal.field, "factor": tuple(np.where([x in best for x in _AXES], -1.0, 1.0))}
+            raise WrongFrame(f"{told} {best}.", flip)
         flip = {"quantity": signal.field, "factor": tuple(FRD)}
         raise WrongFrame(f"{told} if the gyro is of a body with y right and z down.", _NED, flip)
     said = f"{signal} is {factor:.3g} times the derivative of {given}: it is in"
@@ -237,11 +257,57 @@ def _check_by_thrust(
     fits = {name: float(np.mean((u * pull)[moving].sum(-1))) for name, u in up.items()}
     lean = {name: _compare(u[:, :2], pull[:, :2], dt, moving)[0] for name, u in up.items()}
     best = max(lean, key=lambda name: lean[name] + fits[name])
-    if lean[best] + fits[best] > lean["as given"] + fits["as given"] + 6.0 * SURE and lean[best] > 0.5:
+    if lean[best] + fits[best] > lean["as given"] + fits["as given"] + 6.0 * SURE and lean[best] > 0.8:
         raise WrongQuaternion(
             f"{given} leans where the drone accelerates if it is {best} (correlation {lean[best]:.2f}), and not as "
             f"given ({lean['as given']:.2f}). We need w x y z, from body to world.",
             {"quantity": "quaternion", **_QUATERNIONS[best]},
+        )
+
+
+def check_lean(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float, moving: Mask) -> None:
+    """Refuse an attitude that does not lean where the drone accelerates: thrust pulls along the body's z, so that level
+    accelerations are g times its tilt, but for drag and wind."""
+    up = smooth(rotate(at["quaternion"], np.broadcast_to([0.0, 0.0, 1.0], at["velocity"].shape)), dt)
+    tilt, pull = G * up[:, :2] / up[:, 2:].clip(0.3), smooth(slope(at["velocity"], dt), dt)[:, :2]
+    moves, leans = (x[moving].std(0).max() >= LEAN for x in (pull, tilt))
+    if not moves and not leans:
+        return
+    fits = {}  # of directions, as complex numbers: turned by an angle, also after the y axis was mirrored
+    for side in (1.0, -1.0):
+        for shift in range(-round(MAX_LAG / dt), round(MAX_LAG / dt) + 1, max(1, round(0.02 / dt))):
+            a, b = (np.roll(tilt, shift, 0) @ [1.0, side * 1j])[moving], (pull @ [1.0, 1j])[moving]
+            a, b = a - a.mean(), b - b.mean()
+            fits[side, shift] = np.vdot(a, b) / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-12)
+    side, shift = max(fits, key=lambda key: abs(fits[key]))
+    given, best = max(fit.real for (side, _), fit in fits.items() if side > 0.0), fits[side, shift]
+    said = f"By {signals['quaternion']} the drone leans {{}} than it accelerates by {signals['position']}: "
+    if moves and abs(best) > max(0.6, given + 0.15):
+        angle = np.degrees(np.angle(best))
+        turned = f"turned by {angle:.0f} degrees about z" if abs(angle) > 20.0 else ""
+        how = " and ".join(x for x in ("mirrored in y" if side < 0.0 else "", turned) if x)
+        raise WrongFrame(
+            f"{said.format('another way')}the correlation is {given:.2f} as given, and {abs(best):.2f} if the world of "
+            f"position and velocity is {how}. Bring both and the attitude into one world, with z up.",
+            _NED,
+        )
+    sides = [_compare(tilt[:, [k]], pull[:, [k]], dt, moving)[0] for k in (0, 1)]
+    if not moves and given < 0.5:  # it leans against gusts
+        return
+    if given < 0.5 or any(side < 0.3 and x.std() >= LEAN for side, x in zip(sides, tilt[moving].T, strict=True)):
+        raise WrongFrame(
+            f"{said.format('another way')}the correlation is {min(given, *sides):.2f} at best, also if one is turned "
+            "about z, mirrored, or up to 0.3 s late. Name columns of one world, with z up, and of one clock."
+        )
+    gain = float(pull[moving].std(0).max() / tilt[moving].std(0).max())
+    if not 0.4 < gain < 2.5:
+        lengths = {"centimetres": 1e-2, "millimetres": 1e-3, "feet": 0.3048}
+        near = {k: x for k, x in lengths.items() if 0.6 < gain * x < 1.7}
+        degrees = in_units("euler", "the angles are in", degrees=np.pi / 180.0) if gain < 0.1 else []
+        raise WrongUnit(
+            f"{said.format('less' if gain > 1.0 else 'more')}{gain:.3g} times as much acceleration as tilt.",
+            *in_units("position", "the position is in", **near),
+            *degrees,
         )
 
 
@@ -256,6 +322,13 @@ def check_order(
     best = int(worth[0].argmax())
     if worth[:, best].min() < 0.4:
         return f"the order of {signal} was not checked: the flight hardly tells it ({worth[0, best]:.2f} of 3)"
+    plus = turning_fits(at["angular_velocity"], at["motor_command"], dt, parts, _PLUS)
+    plus = plus[..., 0] + plus[..., 1] + np.abs(plus[..., 2])
+    if (plus.max(1) > worth.max(1) + 0.3).all():
+        raise WrongMotors(
+            f"{signal} turn the drone as rotors in front, left, behind and right do (correlations add up to "
+            f"{plus[0].max():.2f}, and in an X to {worth[0, best]:.2f}): only rotors in an X are read."
+        )
     if (worth[:, best] > worth[:, 0] + 0.15).all() and worth[0, best] > worth[0, 0] + 0.2:
         raise WrongMotors(
             f"{signal} explain how the drone turns less in the order front left, back left, back right, front right "

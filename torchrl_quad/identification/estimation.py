@@ -159,8 +159,15 @@ def _with_motors(
 ) -> tuple[QuadrotorParams, MotorCommand]:
     """The drone with a map from motor commands to rotor speeds: its own, or one whose thrust carries it."""
     motors = prior.motor_command
+    volts = [float(x.battery_voltage.mean()) for x in logs if x.battery_voltage is not None]
+    for volt in volts:
+        if motors is not None and not 0.5 < volt / motors.nominal_voltage < 2.0:
+            raise UserValueError(
+                f"identify: a battery has {volt:.3g} V in the mean, and the drone's motor_command is for "
+                f"{motors.nominal_voltage:.3g} V. Say by Columns(names, scale=...) in which unit the log has it, leave "
+                "battery_voltage out, or give the drone the motor_command of its own battery."
+            )
     if motors is None:
-        volts = [float(x.battery_voltage.mean()) for x in logs if x.battery_voltage is not None]
         nominal = float(np.mean(volts)) if volts else 1.0
         motors = MotorCommand(float(np.mean([prediction.carrying_speed(prior, x, nominal) for x in logs])), nominal)
     if delay is not None:

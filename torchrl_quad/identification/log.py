@@ -180,6 +180,7 @@ def _read(
     moving = sound if sound.sum() > 10 else on
     checks.check_velocity(at, signals, step, moving)
     notes.append(checks.check_rates(at, signals, step, moving))
+    checks.check_lean(at, signals, step, moving)
     checks.check_specific_force(at, signals, step, moving)
     segments, found = find_pieces(at, valid, step, path.name, clearance, max_gap, min_duration)
     notes.append(checks.check_order(at, signals, step, segments))
@@ -230,11 +231,15 @@ def _signals(layout: Layout, streams: Sequence[Stream], name: str, notes: list[s
         )
     motors = gathered["motor_command"].columns
     last = re.sub(r"\d+(?=\D*$)", lambda found: str(int(found[0]) + 1), max(motors))  # m5 after m4
+    if last == max(motors):  # e after d
+        last = f"{last[:-1]}{chr(ord(last[-1]) + 1)}"
     if last not in motors and any(last in stream.columns for stream in streams):
         notes.append(f"{last} looks like a fifth motor: only {', '.join(motors)} are read, of a drone with four rotors")
     for quantity, signal in gathered.items():
         if quantity == "battery_voltage" and not (signal.values > 0.0).any():
             continue  # autopilots say 0 where no battery is measured
+        if quantity == "battery_voltage":
+            checks.check_voltage(signal)
         if quantity == "quaternion":
             notes += checks.check_quaternion(clean(signal)[0])
             norm = np.linalg.norm(signal.values, axis=-1, keepdims=True)
@@ -276,7 +281,7 @@ def _grid(signals: Mapping[str, Signal], main: Sequence[Signal], dt: float | Non
         if end - begin < 0.1 * span:
             raise UnreadableLog(f"{said}. Cut it into shorter logs.", {"dt": float(f"{2.0 * span / MAX_STEPS:.2g}")})
         raise GapsTooLarge(
-            f"{said}. The clock of {signal} jumps from {begin:.6g} to {end:.6g} s at sample {k + 1}.",
+            f"{said}. The clock of {signal} jumps from {begin:.10g} to {end:.10g} s at sample {k + 1}.",
             {"span": (float(signal.time[0]), float(begin))},
             {"span": (float(end), float(signal.time[-1]))},
         )

@@ -42,6 +42,8 @@ class Mended:
         when = (*self.when, *filter(None, [todo.pop("when", "")]))
         quantity = todo.pop("quantity", None)
         if quantity is None:
+            if "convention" in todo:  # the order of quaternions is that of the columns, whatever the frame
+                todo["convention"] = replace(todo["convention"], xyzw=layout.convention.xyzw)
             layout = replace(layout, convention=todo.get("convention", layout.convention))
             return replace(self, layout=layout, changes={**self.changes, **todo}, when=when)
         name = todo.get("name", quantity)
@@ -70,10 +72,12 @@ class Mended:
             parts.append(f"columns={{{', '.join(entries)}}}")
         for name, value in self.changes.items():
             if name != "span":
-                said = f"frames.{value.name.lower()}()" if name == "convention" else f"{value:g}"
+                said = f"{value:g}" if name != "convention" else f"frames.{value.name.lower()}()"
+                if name == "convention" and value.xyzw:
+                    said = f"dataclasses.replace({said}, xyzw=True)"
                 parts.append(f"{name}={said}")
         condition = f"If {' and '.join(dict.fromkeys(self.when))}, write " if self.when else "Write "
-        told = [f"Its part from {span[0]:.6g} to {span[1]:.6g} s reads: cut the file there."] if span else []
+        told = [f"Its part from {span[0]:.10g} to {span[1]:.10g} s reads: cut the file there."] if span else []
         return " ".join(told + ([f"{condition}{', '.join(parts)}."] if parts else []))
 
 

@@ -81,7 +81,7 @@ def clean(signal: Signal) -> tuple[Signal, list[str]]:
     if len(back):
         k = back[0]
         raise ClockJumpsBack(
-            f"The clock of {signal} jumps back from {time[k]:.6g} to {time[k + 1]:.6g} s at sample {k + 1}, and "
+            f"The clock of {signal} jumps back from {time[k]:.10g} to {time[k + 1]:.10g} s at sample {k + 1}, and "
             f"{len(back)} time(s) in all: samples have no order in time. Cut the file there and read the parts, or "
             "name the right time column."
         )

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_quad.errors import shown
 from torchrl_quad.identification.autopilots import HEAD, read_dataflash, read_ulog, read_usd
 from torchrl_quad.identification.bags import MAGIC, read_bag
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog
@@ -68,6 +69,8 @@ def _read(file: io.BufferedReader[Any], name: str, columns: Asked, most: int) ->
     try:
         codecs.getincrementaldecoder("utf-8")().decode(start)
     except UnicodeDecodeError as error:
+        if start[:2] in (b"\xff\xfe", b"\xfe\xff") or sum(x > 126 for x in start) < 0.1 * len(start) > 0 < min(start):
+            raise UnreadableLog(f"{name} is text, but not in UTF-8. Save it as CSV in UTF-8.") from error
         raise UnreadableLog(
             f"{name} is not a log of a known kind: it is not text, and does not begin like a ULog, dataflash log, ROS "
             "bag or uSD log (versions 1 and 2). Export it as CSV."
@@ -92,6 +95,8 @@ def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
         raise UnreadableLog(f"{name} is empty. Give a log that has samples.")
     mark = _mark(first)
     header = [part.strip().strip('"') for part in first.split(mark)]
+    if all(_number(x, mark) == _number(x, mark) for x in header):
+        raise UnreadableLog(f"{name}: its first row holds numbers. Put a row above it that names the columns.")
     if len(header) > MAX_COLUMNS:
         raise too_many(name, MAX_COLUMNS, "columns", "Leave some out.")
     samples = list(itertools.islice(rows, 2))
@@ -112,8 +117,15 @@ def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
         raise UnreadableLog(f"{name} has several columns of one name: {', '.join(repeated)}. Rename them.")
     place = {column: k for k, column in enumerate(header) if column in asked}
     flat, pick = array("d"), itemgetter(*place.values(), place[clock])  # of a single place it would not give a tuple
+    notes = list[str]()
     for k, row in enumerate(itertools.chain(samples, rows)):
-        picked = pick(_cells(row, mark, len(header), name, k))[:-1]
+        try:
+            picked = pick(_cells(row, mark, len(header), name, k))[:-1]
+        except UnreadableLog:
+            if next(rows, None) is not None:
+                raise
+            notes.append(f"the last row, {k + 1}, is cut off: left out")
+            break
         try:
             flat.extend([float(cell) for cell in picked])
         except ValueError:
@@ -122,7 +134,10 @@ def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
     values = dict.fromkeys(header, np.broadcast_to(np.nan, len(table)))  # the others are never read
     values |= dict(zip(place, table.T, strict=True))
     time = (values[clock] - np.asarray(layout.time.offset)) * np.asarray(layout.time.scale)
-    return [Stream("csv", time, values)], layout, []
+    if not np.isfinite(time).any():
+        said = _cells(samples[0], mark, len(header), name, 0)[header.index(clock)]
+        raise UnreadableLog(f"{name}: the time in {clock} is no number, but {shown(said)}. Write it in seconds.")
+    return [Stream("csv", time, values)], layout, notes
 
 
 def _preset(header: list[str], name: str, columns: Asked) -> Layout | None:
@@ -147,6 +162,8 @@ def _rows(lines: Iterator[bytes], name: str) -> Iterator[str]:
         except UnicodeDecodeError as error:
             raise UnreadableLog(f"{name}: line {k + 1} is not text in UTF-8. Export it as CSV again.") from error
         text = text.strip(" \r\n\ufeff")
+        if not begun and text.lower().startswith("sep="):  # of a table calculation
+            continue
         if not begun and text[:1] in ("#", "%"):
             remark = text.lstrip("#% ") or remark
             continue
@@ -161,16 +178,18 @@ def _rows(lines: Iterator[bytes], name: str) -> Iterator[str]:
 
 def _mark(header: str) -> str | None:
     """What separates the cells; None is white space."""
-    mark = max(",;\t", key=header.count)
+    mark = max(",;\t|", key=header.count)
     return mark if mark in header else None
 
 
 def _cells(row: str, mark: str | None, width: int, name: str, k: int) -> list[str]:
-    cells = row.split(mark)
+    cells = row.replace('"', "").split(mark)
+    if len(cells) == width + 1 and not cells[-1].strip():  # a separator at the end of each row but the first
+        cells.pop()
     if len(cells) != width:
         raise UnreadableLog(
             f"{name} is not a table of numbers: row {k + 1} has {len(cells)} cells, and the first row names {width}. "
-            "Give a CSV file whose first row names the columns."
+            "Give a CSV file whose first row names the columns: delete the lines above that one."
         )
     return cells
 

@@ -127,6 +127,7 @@ SETTINGS: dict[str, tuple[Any, str]] = {
     ),
     "drone": (str | dict[str, Any], "Where the fit starts: a preset, a YAML file, or a mapping."),
     "mass": (Positive | None, "The mass in kg, from a scale; null if unknown."),
+    "reading": (dict[str, Any] | None, "Other arguments of read_log."),
     "known": (dict[str, Any] | None, "Fields of the drone that are known by measurement."),
     "fields": (list[str] | None, "What to fit; null for everything."),
     "past": (NonNegative, ""),

@@ -10,7 +10,7 @@ import torch
 from refusals import cases, refuses
 
 from torchrl_quad.dynamics import quaternion
-from torchrl_quad.vision import DepthCamera, Primitives, closest_approach, has_way, nearest
+from torchrl_quad.vision import DepthCamera, Primitives, closest_approach, nearest
 from torchrl_quad.vision.primitives import SIZES, distances
 
 
@@ -168,17 +168,6 @@ def test_noise_is_proportional_to_depth_and_drops_its_share_of_pixels():
     assert (seen[:, :, :50][~lost[:, :, :50]] == 10.0).all(), "nothing is measured where nothing is"
     near = seen[:, :, 50:][~lost[:, :, 50:]]
     assert near.mean() == pytest.approx(4.0, abs=0.02) and near.std() == pytest.approx(0.2, rel=0.05)
-
-
-def test_a_way_is_found_through_a_gap_and_none_through_a_wall():
-    def wall(gap):
-        boxes = [[5.0, 5.0 + 0.5 * gap, 2.0, 0.1, 5.0, 2.0], [5.0, -5.0 - 0.5 * gap, 2.0, 0.1, 5.0, 2.0]]
-        boxes = torch.tensor([[[*box, 1.0, 0.0, 0.0, 0.0] for box in boxes]])
-        return Primitives(*(boxes if kind == "boxes" else boxes.new_zeros(1, 0, k) for kind, k in SIZES.items()))
-
-    ends = torch.tensor([0.0, 3.0, 1.5]), torch.tensor([10.0, -3.0, 1.5])
-    box = torch.tensor([-1.0, -4.0, 0.1]), torch.tensor([11.0, 4.0, 3.9])
-    assert [has_way(wall(gap), *ends, *box, 0.13) for gap in (1.0, 0.2, 0.0)] == [True, False, False]
 
 
 @cases(

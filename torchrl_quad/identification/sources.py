@@ -144,8 +144,9 @@ def _preset(header: list[str], name: str, columns: Asked) -> Layout | None:
     """What a mapping changes; None for one that describes the whole file, or will be told what it lacks."""
     if not isinstance(columns, Mapping) or all(set(columns) & set(quantities) for quantities in NEEDED):
         return None
+    clocks = [x for layout in LAYOUTS.values() for x in layout.time.names] if "time" in columns else []
     with contextlib.suppress(MissingColumns) if "position" in columns else contextlib.nullcontext():
-        return match(header, name)
+        return match([*header, *clocks], name)
 
 
 def _rows(lines: Iterator[bytes], name: str) -> Iterator[str]:

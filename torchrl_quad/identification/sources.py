@@ -188,9 +188,10 @@ def _cells(row: str, mark: str | None, width: int, name: str, k: int) -> list[st
     if len(cells) == width + 1 and not cells[-1].strip():  # a separator at the end of each row but the first
         cells.pop()
     if len(cells) != width:
+        above = "Give a CSV file whose first row names the columns: delete the lines above that one."
         raise UnreadableLog(
             f"{name} is not a table of numbers: row {k + 1} has {len(cells)} cells, and the first row names {width}. "
-            "Give a CSV file whose first row names the columns: delete the lines above that one."
+            f"{'Leave that row out.' if k > 1 else above}"
         )
     return cells
 

@@ -342,6 +342,7 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_th
     ("x.sdf", sdf(FRAME + motors(motorConstant=2e-5)), "rotors differ in motorConstant"),
     ("x.sdf", sdf(FRAME.replace(J, "") + motors()), "inertia .*: the link 'base_link' has a mass and no <inertia>"),
     ("x.sdf", sdf(FRAME + motors() + "<plugin filename='gz-sim-lift-drag'/>"), r"it has wings \(LiftDrag\)"),
+    ("x.sdf", sdf("<include><placement_frame>a</placement_frame></include>"), "a placement_frame is not read"),
     (
         "x.sdf",
         sdf(FRAME.replace("'j0'/>", "'j9'/>")),
@@ -391,6 +392,11 @@ def test_parts_of_a_model_stand_where_its_simulator_puts_them(tmp_path):
         include.format("", "https://host/1.0/owner/models/frame/3", "<name>v</name>") + load.format("v", 0.04 - 0.24),
         include.format("", "file://frame/model.sdf", "<pose>0 0 1 0 0 0</pose>") + load.format("x::base_link", -0.2),
         f"<model name='m'><pose>0 0 3 0 0 0</pose>{FRAME}</model>" + load.format("m::base_link", -0.2),
+        FRAME + "<plugin filename='gz-sim-lift-drag'><link_name>x::rotor_0</link_name></plugin>"
+        "<frame name='f' attached_to='base_link'><pose degrees='true'>0.2 0.5 0 0 0 90</pose></frame>"
+        + load.format("f", -0.2).replace("0 0 -0.2 0 0 0", "-0.5 0.2 -0.2 0 0 -1.5707963"),
+        f"<model name='m'><pose>1 0 3 0 0 3.14159265</pose>{FRAME}</model><frame name='g' attached_to='m::base_link'/>"
+        + load.format("g", -0.2),
     )
     for i, way in enumerate(ways):
         (tmp_path / f"{i}").mkdir()
@@ -406,10 +412,11 @@ def test_rotors_are_found_by_their_names_and_axes_and_what_follows_from_a_given_
     guards = "".join(f"<link name='prop_guard_{i}'><inertial/></link>" for i in range(4))
     turned = "".join(
         f"<joint name='j{i}' type='continuous'><parent link='base_link'/><child link='motor{i}_link'/>"
-        f"<origin rpy='1.5707963 0 0'/><axis xyz='0 {-1 if i else 1} 0'/></joint>"
+        f"<origin rpy='1.5707963 0 0'/><axis xyz='0 {-2 if i else 1} 0'/></joint>"
         for i in range(4)
     )
-    guarded = flat.replace("base_link", "quadrotor1_base").replace("</robot>", guards + "</robot>")
+    guards += "<link name='rotor_0_guard'><inertial/></link>"
+    guarded = flat.replace("base_link", "quad_rotor1_base").replace("</robot>", guards + "</robot>")
     (tmp_path / "x.urdf").write_text(guarded)
     wanted = load_drone(tmp_path / "x.urdf", torch.float64, motor_time_constant=0.05)
     assert "of motor0_link, motor1_link" in import_drone(tmp_path / "x.urdf", motor_time_constant=0.05)

@@ -156,11 +156,6 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
         "WrongFrame",
         "of position and .* is mirrored in y",
     ),
-    "y up": (
-        lambda t: {n: f * t[k] for a in "pv" for n, k, f in ((f"{a}y", f"{a}z", 1.0), (f"{a}z", f"{a}y", -1.0))},
-        "WrongFrame",
-        "leans another way .* Name columns of one world, with z up",
-    ),
     "attitude of another time": (
         lambda t: {n: np.roll(t[n], 150) for n in TURN + GYRO},
         "WrongFrame",
@@ -178,7 +173,7 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
 
 HOPELESS = {"motors beyond full", "motors are thrusts", "motors hardly run", "motors turn to and fro", "no numbers"}
 HOPELESS |= {"clock jumps back", "motors off", "never in the air"}
-HOPELESS |= {"world turned", "world mirrored", "y up", "attitude of another time"}
+HOPELESS |= {"world turned", "world mirrored", "attitude of another time"}
 
 
 def test_a_tracker_that_jumps_is_cut_out(table, read):

@@ -8,7 +8,9 @@ import re
 import numpy as np
 import pytest
 import torch
+from log_writers import OURS, TABLE, G, write_csv
 from refusals import refuses
+from scipy.spatial.transform import Rotation
 from small_runs import ROOT
 
 from benchmarks import identification as benchmark
@@ -292,3 +294,41 @@ def test_the_recipe_fits_a_real_flight_and_draws_it(launch, refused, tmp_path):
     assert sorted(path.name for path in (tmp_path / "fit").iterdir()) == names.split()
     assert refused("identify", "logs=[none.csv]").startswith("Error: none.csv")
     assert "mass=-1: it must be greater than 0" in refused("identify", f"logs=[{REAL}]", "mass=-1")
+
+
+def by_thrust(t, position, push=0.0, turned=0.0):
+    """The table of a flight by a thrust that leaves ``push`` (T, 3) [m/s^2] to drag and wind, ``turned`` about y beside
+    [rad]."""
+    velocity = np.gradient(position, t, axis=0)
+    up = np.gradient(velocity, t, axis=0) + (0.0, 0.0, G) - push
+    x, y, z = (up / np.linalg.norm(up, axis=-1, keepdims=True)).T
+    lean = Rotation.from_quat(np.stack((-y, x, 0.0 * x, 1.0 + z), -1))
+    lean *= Rotation.from_rotvec(np.outer(turned + 0.0 * t, (0.0, 1.0, 0.0)))
+    quaternion = lean.as_quat(scalar_first=True)
+    rates = np.zeros_like(position)
+    rates[1:-1] = (lean[:-2].inv() * lean[2:]).as_rotvec() / (t[2:] - t[:-2])[:, None]
+    command = np.full((len(t), 4), 0.5)
+    true = {"position": position, "velocity": velocity, "quaternion": quaternion, "angular_velocity": rates}
+    columns = {"t": t}
+    for quantity, values in (true | {"motor_command": command}).items():
+        columns |= dict(zip(OURS[quantity], values.T, strict=True))
+    return columns
+
+
+def test_drag_wind_flips_and_noise_are_no_reason_to_refuse_a_flight(tmp_path):
+    t, mapping = np.arange(0.0, 30.0, 0.01), {k: x for k, x in TABLE.items() if k != "acceleration"}
+    height = 20.0 + 0.3 * np.sin(0.9 * t)
+    circle = np.stack((50.0 * np.cos(0.2 * t), 50.0 * np.sin(0.2 * t), height), -1)
+    along = np.stack((3.0 * np.sin(1.2 * t), 0.0 * t, height), -1)
+    gusts = np.stack((0.0 * t, 0.7 * np.sin(2.1 * t) + 0.5 * np.sin(0.7 * t + 1.0), 0.0 * t), -1)
+    flips = 2.0 * np.pi * np.clip((t % 4.0 - 1.0) / 0.5, 0.0, 1.0)
+    hover = np.stack((0.0 * t, 0.0 * t, height), -1)
+    noisy = hover + 0.002 * np.random.default_rng(0).standard_normal(hover.shape)
+    for name, table in {
+        "circle": by_thrust(t, circle, -0.3 * np.gradient(circle, t, axis=0)),
+        "crosswind": by_thrust(t, along, gusts),
+        "flips": by_thrust(t, hover, turned=flips),
+        "noise": by_thrust(t, hover, turned=0.02 * np.sin(3.0 * t)) | dict(zip("xyz", noisy.T, strict=True)),
+    }.items():
+        columns = mapping if name != "noise" else {k: x for k, x in mapping.items() if k != "velocity"}
+        assert len(read_log(write_csv(tmp_path / f"{name}.csv", table), columns).time) > 2900, name

@@ -84,7 +84,12 @@ def usable(given: Mapping[str, Any]) -> Found:
     for name, value in given.items():
         with contextlib.suppress(ValueError, TypeError, RecursionError, KeyError):
             array, shape = presets.as_array(value), FIELDS[name]["shape"]
-            if array.ndim == (0 if shape == (1,) else len(shape)):
+            want = () if shape == (1,) else shape
+            if (
+                array.size
+                and len(want) == array.ndim
+                and all(n in ("n", m) for n, m in zip(want, array.shape, strict=True))
+            ):
                 found[name] = array, GIVEN
     return found
 

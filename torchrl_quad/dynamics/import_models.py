@@ -28,6 +28,7 @@ from torchrl_quad.dynamics.import_formats import (
 )
 from torchrl_quad.errors import UserValueError, one_line, shown
 
+_NO_ROTOR = re.compile("guard|(quad|hexa|octo|multi)_?rotor")  # though its name holds one
 DEPTH = 20  # of models, joints and frames within each other
 # Of each link: its mass, the frame of its centre of mass, its inertia there (NaN where nothing is said), and two
 # directions: of its z axis, and of the axis that it turns about.
@@ -42,23 +43,26 @@ def read_xml(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
         _add_urdf(root, links, str(path))
         plugins += root.iter("plugin")
     elif models:
-        _add_sdf(models[0], np.eye(4), path, links, plugins)
+        drone = max(models, key=lambda model: len([*model.iter("plugin"), *model.iter("include")]))  # not the ground
+        _add_sdf(drone, np.eye(4), path, links, plugins)
     else:
         raise UserValueError(
             f"{path}: XML with the root <{one_line(root.tag)}> is no URDF or SDF with a model. {READABLE}"
         )
-    if any("liftdrag" in re.sub(r"\W|_", "", x.get("filename", "").lower()) for x in plugins):
-        raise UserValueError(f"{path}: it has wings (LiftDrag), and a drone here has rotors alone. Take a multicopter.")
     motors = sorted(
         (x for x in plugins if x.find("motorConstant") is not None), key=lambda x: _digits(x.findtext("motorNumber"))
     )
     short = {re.split("/|::", name)[-1]: name for name in links}
     rotors = [short.get(re.split("/|::", (x.findtext("linkName") or "").strip())[-1], "") for x in motors]
     for word in ("rotor", "prop", "motor"):
-        named = rf"(?<!quad)(?<!hexa)(?<!octo){word}(?!\D*guard)\D*\d+"
-        rotors = rotors or sorted((x for x in links if re.search(named, x.lower())), key=_digits)
+        named = [x for x in links if re.search(rf"{word}\D{{0,20}}\d", x.lower())]
+        rotors = rotors or sorted((x for x in named if not _NO_ROTOR.search(x.lower())), key=_digits)
     if "" in rotors:
         raise UserValueError(f"{path}: the linkName of a motor is that of no link with an <inertial>. Add it.")
+    lifts = [x for x in plugins if "liftdrag" in re.sub(r"\W|_", "", x.get("filename", "").lower())]
+    blades = {re.split("/|::", x)[-1] for x in rotors}
+    if any(re.split("/|::", (x.findtext("link_name") or "").strip())[-1] not in blades for x in lifts):
+        raise UserValueError(f"{path}: it has wings (LiftDrag), and a drone here has rotors alone. Take a multicopter.")
     found = _body(links, rotors, bool(motors)) | given
     _add_motors(found, motors, str(path), given)
     if (said := root.find("properties")) is not None and root.tag == "robot":
@@ -128,7 +132,8 @@ def _add_urdf(root: ET.Element, links: Links, source: str) -> None:
         )
         axis = joints[name].find("axis") if name in joints and joints[name].get("type") != "fixed" else None
         turns = np.array([0.0, 0.0, 1.0]) if axis is None else _numbers(axis.get("xyz"), 3, source)
-        turns = frame[:3, :3] @ turns * (1.0 if axis is None or (frame[:3, :3] @ turns)[2] >= 0.0 else -1.0)
+        turns = frame[:3, :3] @ turns / max(np.linalg.norm(turns), 1e-9)
+        turns *= -1.0 if turns[2] < 0.0 else 1.0  # a rotor may turn either way about it
         inertia = symmetric(*moments) if "inertia" in about else np.full((3, 3), np.nan)
         links[name] = mass, frame @ origin(inertial), inertia, np.stack((frame[:3, 2], turns))
 
@@ -162,6 +167,8 @@ def _add_sdf(
     plugins += model.iterfind("plugin")
     for inner in (x for x in model if x.tag in ("model", "include")):
         file, said, place = path, inner, standing(inner)
+        if inner.find("placement_frame") is not None:
+            raise UserValueError(f"{path}: a placement_frame is not read. Write the pose of the model's own frame.")
         if inner.tag == "include":
             file, said = _included(path, inner.findtext("uri", ""))
             place = place if inner.find("pose") is not None else place @ own(said)
@@ -175,11 +182,11 @@ def _add_sdf(
                 _numbers(inertial.findtext(x), 1, str(path))[0] for x in ("mass", *(f"inertia/i{a}" for a in AXES))
             )
             name, frame = link.get("name", ""), standing(link)
-            while name in links:  # of another model
-                name = f"other::{name}"
+            if name in links:  # of another model
+                name = f"other{len(links)}::{name}"
             inertia = symmetric(*moments) if inertial.find("inertia") is not None else np.full((3, 3), np.nan)
             links[name] = mass, frame @ own(inertial), inertia, frame[:3, [2, 2]].T
-    return inside | {x: standing(names[x]) for x in names if names[x].tag == "link"}
+    return inside | {x: standing(names[x]) for x in names if names[x].tag in ("link", "frame")}
 
 
 def _included(path: Path, uri: str) -> tuple[Path, ET.Element]:

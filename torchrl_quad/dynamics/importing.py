@@ -110,11 +110,11 @@ def _flow(value: Array) -> str:
 
 def _completed(source: str, kind: str, found: Found, fields: Mapping[str, Any]) -> Found:
     """What a file and a user say, and what is ours; an error names all that is missing."""
-    found = found | {k: (v, GIVEN) for k, v in fields.items()}
+    known, found = found | usable(fields), found | {k: (v, GIVEN) for k, v in fields.items()}
     if missing := [name for name in ASKED if found.get(name, (None,))[0] is None]:
         why = [f": {found[x][1]}" if x in found and found[x][1] else "" for x in missing]
         names = ", ".join(f"{x} [{FIELDS[x]['unit'] or '1'}]{y}" for x, y in zip(missing, why, strict=True))
-        like = ", ".join(f"{x}={y}" for x, y in _examples(found).items() if x in missing)
+        like = ", ".join(f"{x}={y}" for x, y in _examples(known).items() if x in missing)
         raise UserValueError(
             f"{source} ({kind}) does not say {names}. Give your own numbers, in SI units and our frame, such as "
             f"load_drone({source!r}, {like}), or the same as arguments of recipes/import_drone.py."

@@ -29,8 +29,8 @@ def own_format(source: str, values: Mapping[str, Any]) -> dict[str, Any]:
         UserValueError: what a file must say is missing, or not of the right form.
     """
     values = dict(values)
-    if isinstance(listed := values.pop("track_config", None), Mapping):  # of isaac_drone_racer
-        values |= listed
+    if isinstance(values.get("track_config"), Mapping):  # of isaac_drone_racer
+        values = {**values.pop("track_config"), **values}
     gates = values.get("gates")
     by_name = gates if isinstance(gates, Mapping) else values
     named = {name: gate for name, gate in by_name.items() if isinstance(gate, Mapping)}

@@ -112,7 +112,7 @@ def _layout(bag: Any, topics: Mapping[str, str], columns: Asked, name: str) -> L
         return choose(columns, None)
     given = columns or {}
     named, pose = set(given), {"position", "quaternion", "velocity_body"}
-    places = [name for x in pose & named for name in _names(given[x])]
+    places = [name for x in {"position", "quaternion"} & named for name in _names(given[x])]
     of = {topic for topic in topics if any(place.startswith(f"{topic}.") for place in places)}
     if places and not of:
         named |= pose

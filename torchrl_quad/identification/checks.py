@@ -243,7 +243,9 @@ def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: floa
             derive,
         )
     if not 1.0 / 3.0 < factor < 3.0:
-        raise WrongUnit(f"{said} an unknown unit.", derive)
+        near = given.field == "euler" and 1.0 / 3.0 < factor * 180.0 / np.pi < 3.0
+        degrees = in_units("euler", "the angles are in", degrees=np.pi / 180.0) if near else []
+        raise WrongUnit(f"{said} an unknown unit.", *degrees, derive)
     return f"{signal} fits the attitude: correlation {fit:.2f}, {1000.0 * lag:+.0f} ms late"
 
 
@@ -266,41 +268,52 @@ def _check_by_thrust(
 
 
 def check_lean(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float, moving: Mask) -> None:
-    """Refuse an attitude that does not lean where the drone accelerates: thrust pulls along the body's z, so that level
-    accelerations are g times its tilt, but for drag and wind."""
-    up = smooth(rotate(at["quaternion"], np.broadcast_to([0.0, 0.0, 1.0], at["velocity"].shape)), dt)
-    tilt, pull = G * up[:, :2] / up[:, 2:].clip(0.3), smooth(slope(at["velocity"], dt), dt)[:, :2]
-    moves, leans = (x[moving].std(0).max() >= LEAN for x in (pull, tilt))
-    if not moves and not leans:
+    """Refuse an attitude that does not lean where the drone accelerates: thrust pulls along the body's z, and the rest
+    of what accelerates it follows its velocity, as drag does, or is the wind's, which may hide all."""
+    speed, force = smooth(at["velocity"], dt), smooth(slope(at["velocity"], dt), dt)
+    up = smooth(rotate(at["quaternion"], np.broadcast_to([0.0, 0.0, 1.0], force.shape)), dt)
+    lean, rows = G * up[:, :2] / up[:, 2:].clip(0.5), np.flatnonzero(moving & (up[:, 2] > 0.5))
+    if len(rows) * dt < 3.0:
         return
+    tilt, pull = (np.array(x[:, :2]) for x in (lean, force))
+    for k in (0, 1):
+        by = np.stack((np.ones(len(speed)), speed[:, k]), -1)
+        for x in (tilt, pull):
+            x[:, k] -= by @ np.linalg.lstsq(by[rows], x[rows, k], rcond=None)[0]
+    parts = (rows, rows[: len(rows) // 2], rows[len(rows) // 2 :])  # what is chance in one half is not in the other
+    moves, leans = (x[rows].std(0).max() >= LEAN for x in (pull, tilt))
     fits = {}  # of directions, as complex numbers: turned by an angle, also after the y axis was mirrored
     for side in (1.0, -1.0):
         for shift in range(-round(MAX_LAG / dt), round(MAX_LAG / dt) + 1, max(1, round(0.02 / dt))):
-            a, b = (np.roll(tilt, shift, 0) @ [1.0, side * 1j])[moving], (pull @ [1.0, 1j])[moving]
-            a, b = a - a.mean(), b - b.mean()
-            fits[side, shift] = np.vdot(a, b) / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-12)
-    side, shift = max(fits, key=lambda key: abs(fits[key]))
-    given, best = max(fit.real for (side, _), fit in fits.items() if side > 0.0), fits[side, shift]
+            a, b = np.roll(tilt, shift, 0) @ [1.0, side * 1j], pull @ [1.0, 1j]
+            fits[side, shift] = np.array(
+                [np.vdot(a[x], b[x]) / max(np.linalg.norm(a[x]) * np.linalg.norm(b[x]), 1e-12) for x in parts]
+            )
+    side, shift = max(fits, key=lambda key: abs(fits[key][0]))
+    best, given = fits[side, shift], np.max([fit.real for (side, _), fit in fits.items() if side > 0.0], 0)
     said = f"By {signals['quaternion']} the drone leans {{}} than it accelerates by {signals['position']}: "
-    if moves and abs(best) > max(0.6, given + 0.15):
-        angle = np.degrees(np.angle(best))
+    if moves and (abs(best) > np.maximum(0.6, given + 0.15)).all() and abs(np.angle(best[1] / best[2])) < 0.5:
+        a, b = (x[rows] - x[rows].mean(0) for x in (np.roll(lean, shift, 0), force[:, :2]))  # with what drag explains
+        angle = np.degrees(np.angle(np.vdot(a @ [1.0, side * 1j], b @ [1.0, 1j])))
         turned = f"turned by {angle:.0f} degrees about z" if abs(angle) > 20.0 else ""
         how = " and ".join(x for x in ("mirrored in y" if side < 0.0 else "", turned) if x)
         raise WrongFrame(
-            f"{said.format('another way')}the correlation is {given:.2f} as given, and {abs(best):.2f} if the world of "
-            f"position and velocity is {how}. Bring both and the attitude into one world, with z up.",
+            f"{said.format('another way')}the correlation is {given[0]:.2f} as given, and {abs(best[0]):.2f} if the "
+            f"world of position and velocity is {how}. Bring both and the attitude into one world, with z up.",
             _NED,
         )
     sides = [_compare(tilt[:, [k]], pull[:, [k]], dt, moving)[0] for k in (0, 1)]
-    if not moves and given < 0.5:  # it leans against gusts
-        return
-    if given < 0.5 or any(side < 0.3 and x.std() >= LEAN for side, x in zip(sides, tilt[moving].T, strict=True)):
+    apart = any(x < 0.3 and min(tilt[rows, k].std(), pull[rows, k].std()) >= LEAN for k, x in enumerate(sides))
+    if apart or (moves and leans and (given < 0.5).all()):
         raise WrongFrame(
-            f"{said.format('another way')}the correlation is {min(given, *sides):.2f} at best, also if one is turned "
-            "about z, mirrored, or up to 0.3 s late. Name columns of one world, with z up, and of one clock."
+            f"{said.format('another way')}the correlation is {min(given[0], *sides):.2f} at best, also if one is "
+            "turned about z, mirrored, or up to 0.3 s late. Name columns of one world, with z up, and of one clock."
         )
-    gain = float(pull[moving].std(0).max() / tilt[moving].std(0).max())
-    if not 0.4 < gain < 2.5:
+    gain = float(pull[rows].std(0).max() / max(tilt[rows].std(0).max(), 1e-12))
+    pushed = up[:, :2] * np.linalg.norm(force + (0.0, 0.0, G), axis=-1, keepdims=True)  # less where rotors hardly turn
+    ratio = float(force[rows, :2].std(0).max() / max(pushed[rows].std(0).max(), 1e-12))
+    sure = given.min() > (0.6 if moves else 0.85) and not 0.6 < ratio < 1.7
+    if (moves or leans) and sure and not 0.4 < gain < 2.5:
         lengths = {"centimetres": 1e-2, "millimetres": 1e-3, "feet": 0.3048}
         near = {k: x for k, x in lengths.items() if 0.6 < gain * x < 1.7}
         degrees = in_units("euler", "the angles are in", degrees=np.pi / 180.0) if gain < 0.1 else []

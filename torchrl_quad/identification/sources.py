@@ -69,7 +69,9 @@ def _read(file: io.BufferedReader[Any], name: str, columns: Asked, most: int) ->
     try:
         codecs.getincrementaldecoder("utf-8")().decode(start)
     except UnicodeDecodeError as error:
-        if start[:2] in (b"\xff\xfe", b"\xfe\xff") or sum(x > 126 for x in start) < 0.1 * len(start) > 0 < min(start):
+        if start[:2] in (b"\xff\xfe", b"\xfe\xff") or (
+            0 not in start and sum(x > 126 for x in start) < 0.1 * len(start)
+        ):
             raise UnreadableLog(f"{name} is text, but not in UTF-8. Save it as CSV in UTF-8.") from error
         raise UnreadableLog(
             f"{name} is not a log of a known kind: it is not text, and does not begin like a ULog, dataflash log, ROS "
@@ -95,13 +97,15 @@ def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
         raise UnreadableLog(f"{name} is empty. Give a log that has samples.")
     mark = _mark(first)
     header = [part.strip().strip('"') for part in first.split(mark)]
-    if all(_number(x, mark) == _number(x, mark) for x in header):
+    if not isinstance(columns, Mapping) and all(_number(x, mark) == _number(x, mark) for x in header):
         raise UnreadableLog(f"{name}: its first row holds numbers. Put a row above it that names the columns.")
     if len(header) > MAX_COLUMNS:
         raise too_many(name, MAX_COLUMNS, "columns", "Leave some out.")
     samples = list(itertools.islice(rows, 2))
     if len(samples) < 2:
         raise UnreadableLog(f"{name} has fewer than two samples below its header. Give the log of a flight.")
+    if samples[0].count(mark or " ") == len(header) and samples[0].endswith(mark or " "):
+        header.append("")  # a separator ends each row but the first
     for k, row in enumerate(samples):  # before anything is said of its columns: it may be no table
         _cells(row, mark, len(header), name, k)
     layout = match(header, name) if columns is None else choose(columns, _preset(header, name, columns))
@@ -179,14 +183,12 @@ def _rows(lines: Iterator[bytes], name: str) -> Iterator[str]:
 
 def _mark(header: str) -> str | None:
     """What separates the cells; None is white space."""
-    mark = max(",;\t|", key=header.count)
-    return mark if mark in header else None
+    mark = max(",;\t", key=header.count)
+    return mark if mark in header else "|" if header.count("|") > 1 else None
 
 
 def _cells(row: str, mark: str | None, width: int, name: str, k: int) -> list[str]:
     cells = row.replace('"', "").split(mark)
-    if len(cells) == width + 1 and not cells[-1].strip():  # a separator at the end of each row but the first
-        cells.pop()
     if len(cells) != width:
         above = "Give a CSV file whose first row names the columns: delete the lines above that one."
         raise UnreadableLog(

@@ -159,8 +159,8 @@ def _add_sdf(
             )
         return inside.get(base, outer) @ own(element)
 
-    if depth > DEPTH:
-        raise UserValueError(f"{path}: more than {DEPTH} models lie within each other. Write it flatter.")
+    if depth > DEPTH // 2:
+        raise UserValueError(f"{path}: more than {DEPTH // 2} models lie within each other. Write it flatter.")
 
     names = {x.get("name", ""): x for x in model if x.tag in ("link", "joint", "frame", "model")}
     inside = dict[str, Array]()  # what the models within have

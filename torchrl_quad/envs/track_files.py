@@ -167,7 +167,7 @@ def posed(centres: Any, rotations: Any) -> list[dict[str, Any]]:
 
 def _in_order(gates: Mapping[str, Mapping]) -> list[Mapping[str, Any]]:
     """Gates by the number in their name: Gate10 comes after Gate2."""
-    numbers = {name: re.findall(r"\d+", name) for name in gates}
+    numbers = {name: re.findall(r"\d+", str(name)) for name in gates}
     if unnumbered := [name for name, found in numbers.items() if not found]:
         raise UserValueError(f"The name of gate {shown(unnumbered[0])} has no number. Number them in order.")
     return [gates[name] for name in sorted(gates, key=lambda name: int(numbers[name][-1]))]

@@ -348,7 +348,11 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_th
         sdf(FRAME.replace("'j0'/>", "'j9'/>")),
         "a pose is relative to 'j9', which is no link",
     ),
-    ("x.sdf", sdf(FRAME.replace("0.1 0 0 0<", "0.1 3.141592654 0 0<") + motors()), "let rotor_direction point up"),
+    (
+        "x.sdf",
+        sdf(FRAME.replace("0.1 0 0 0<", "0.1 3.141592654 0 0<") + motors()),
+        r"x.sdf: to hover, .*let rotor_direction point up",
+    ),
     ("x.urdf", URDF.format("cf", 0).replace("'prop", "'w"), "rotor_positions .* no link with an <inertial> is named"),
     (
         "x.json",

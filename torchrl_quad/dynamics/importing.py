@@ -127,7 +127,10 @@ def _completed(source: str, kind: str, found: Found, fields: Mapping[str, Any]) 
     found = ours | {k: v for k, v in found.items() if v[0] is not None}
     plain = {"rate_gain": [1.0] * 3, "rate_damping": [0.0] * 3, "max_thrust_to_weight": 1.5, "max_body_rate": [6.0] * 3}
     drone = read_drone(plain | {k: v for k, (v, _) in found.items()}, torch.float64, source)
-    rotors = FlightController(drone)
+    try:
+        rotors = FlightController(drone)
+    except UserValueError as error:
+        raise UserValueError(str(error).replace("drone:", f"{source}:", 1)) from None
     most = rotors.reach().clamp(1.1, 5.0)
     rates = rotors.spare_torque() / drone.inertia * torch.tensor([0.1, 0.1, 0.5])
     rates = rates.minimum(torch.tensor([6.0, 6.0, 2.0])).clamp_min(0.1)

@@ -60,6 +60,12 @@ class Drone:
         self.weight = self.mass * self.gravity
         self.hover_speed = self.speed(self.mixer[:, 0] * self.weight)
 
+    def __eq__(self, other: object) -> bool:
+        """Whether all numbers are the same."""
+        if not isinstance(other, Drone) or vars(self).keys() != vars(other).keys():
+            return False
+        return all(np.array_equal(x, vars(other)[name]) for name, x in vars(self).items())
+
     def thrust(self, speed: Array) -> Array:
         """Thrust [N] of rotors that turn at a speed [rad/s]."""
         return self.thrust_map[0] * (speed - self.vertex_speed) ** 2 + self.vertex_thrust

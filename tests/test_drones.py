@@ -431,6 +431,9 @@ def test_rotors_are_found_by_their_names_and_axes_and_what_follows_from_a_given_
     heavy = load_drone(tmp_path / "x.urdf", torch.float64, motor_time_constant=0.05, mass=1.6)
     torch.testing.assert_close(heavy.linear_drag, 2.0 * wanted.linear_drag)  # rotors turn twice as fast to carry it
     torch.testing.assert_close(heavy.rotor_speed_max, 2.0 * wanted.rotor_speed_max)
+    more = {"thrust_map": (4.0 * wanted.thrust_map).tolist(), "motor_time_constant": 0.05}
+    strong = load_drone(tmp_path / "x.urdf", torch.float64, **more)
+    torch.testing.assert_close(2.0 * strong.rotor_speed_max, wanted.rotor_speed_max)  # by the file's thrust2weight
 
 
 def test_the_recipe_writes_a_drone_from_a_model_and_what_it_includes(tmp_path, monkeypatch, capsys):

@@ -253,6 +253,7 @@ def _add_attributes(found: Found, said: Said, name: str) -> None:
         found["rotor_spin"] = spin, "of the code of gym-pybullet-drones, not in the file"
     if force is not None and force > 0.0:
         found["thrust_map"] = [force / RPM**2, 0.0, 0.0], "kf"
+        found |= said.given
         if torque is not None:
             found["yaw_torque_coefficient"] = torque / force, "km per kf"
         if ratio is not None and mass and places is not None:
@@ -260,5 +261,4 @@ def _add_attributes(found: Found, said: Said, name: str) -> None:
                 speed_at(ratio * 9.81 * mass / len(places), found["thrust_map"][0]),
                 "of thrust2weight",
             )
-        found |= said.given
         add_drag(found, said("drag_coeff_xy"), said("drag_coeff_z"))

@@ -208,9 +208,9 @@ def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: floa
     if turning < CALM / 5.0:
         return calm
     trials = {name: (smooth(body_rates(h, dt), dt), smooth(gyro, dt)) for name, h in hypotheses.items()}
-    trials["body y right, z down"] = (right, smooth(gyro * FRD, dt))
-    for k, axis in enumerate(_AXES):
-        trials[f"with {axis} the other way"] = right, smooth(gyro * np.where(np.arange(3) == k, -1.0, 1.0), dt)
+    signs = {"if the gyro is of a body with y right and z down": FRD}
+    signs |= {f"with {axis} the other way": 1.0 - 2.0 * np.eye(3)[k] for k, axis in enumerate(_AXES)}
+    trials |= {name: (right, smooth(gyro * sign, dt)) for name, sign in signs.items()}
     trials["in the world frame"] = (right, smooth(rotate_inverse(q, gyro), dt))
     fits = {name: _compare(b, a, dt, moving) for name, (a, b) in trials.items()}
     fit, factor, lag = fits["as given"]
@@ -224,11 +224,8 @@ def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: floa
             )
         if best == "in the world frame":
             raise WrongFrame(f"{told} if the gyro is in the world frame.", {"quantity": signal.field, "drop": True})
-        if " the other way" in best:
-            flip = {"quantity": signal.field, "factor": tuple(np.where([x in best for x in _AXES], -1.0, 1.0))}
-            raise WrongFrame(f"{told} {best}.", flip)
-        flip = {"quantity": signal.field, "factor": tuple(FRD)}
-        raise WrongFrame(f"{told} if the gyro is of a body with y right and z down.", _NED, flip)
+        flip = {"quantity": signal.field, "factor": tuple(signs[best])}
+        raise WrongFrame(f"{told} {best}.", *([_NED] if signs[best] is FRD else []), flip)
     said = f"{signal} is {factor:.3g} times the derivative of {given}: it is in"
     for unit, scale in (("degrees", np.pi / 180.0), ("milliradians", 1e-3)):
         if 1.0 / 3.0 < factor * scale < 3.0 and fit > 0.2:
@@ -330,13 +327,16 @@ def check_order(
     """Refuse motors in another order than the one in which they turn the drone, as far as the flight tells it."""
     signal, rows = signals["motor_command"], np.concatenate([np.arange(start, stop) for start, stop in pieces])
     parts = (rows, rows[: len(rows) // 2], rows[len(rows) // 2 :])  # what is chance in one half is not in the other
-    fits = turning_fits(at["angular_velocity"], at["motor_command"], dt, parts)
-    worth = fits[..., 0] + fits[..., 1] + np.abs(fits[..., 2])  # yaw: which turn alike, not which way
+
+    def worth_of(signs: Array) -> Array:
+        fits = turning_fits(at["angular_velocity"], at["motor_command"], dt, parts, signs)
+        return fits[..., 0] + fits[..., 1] + np.abs(fits[..., 2])  # yaw: which turn alike, not which way
+
+    worth = worth_of(_X)
     best = int(worth[0].argmax())
     if worth[:, best].min() < 0.4:
         return f"the order of {signal} was not checked: the flight hardly tells it ({worth[0, best]:.2f} of 3)"
-    plus = turning_fits(at["angular_velocity"], at["motor_command"], dt, parts, _PLUS)
-    plus = plus[..., 0] + plus[..., 1] + np.abs(plus[..., 2])
+    plus = worth_of(_PLUS)
     if (plus.max(1) > worth.max(1) + 0.3).all():
         raise WrongMotors(
             f"{signal} turn the drone as rotors in front, left, behind and right do (correlations add up to "

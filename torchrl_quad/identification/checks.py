@@ -356,7 +356,7 @@ def check_order(
 
 
 def turning_fits(
-    rates: Array, command: Array, dt: float, parts: Sequence[NDArray[np.int_]], signs: ArrayLike = _X
+    rates: Array, command: Array, dt: float, parts: Sequence[NDArray[np.int_]], signs: ArrayLike
 ) -> Array:
     """How well the motors explain the angular acceleration about each axis in each order, as correlations
     (parts, 24, 3); ``signs`` (3, 4) are those of roll, pitch and yaw by each motor."""

@@ -355,9 +355,7 @@ def check_order(
     )
 
 
-def turning_fits(
-    rates: Array, command: Array, dt: float, parts: Sequence[NDArray[np.int_]], signs: ArrayLike
-) -> Array:
+def turning_fits(rates: Array, command: Array, dt: float, parts: Sequence[NDArray[np.int_]], signs: ArrayLike) -> Array:
     """How well the motors explain the angular acceleration about each axis in each order, as correlations
     (parts, 24, 3); ``signs`` (3, 4) are those of roll, pitch and yaw by each motor."""
     mixing = np.zeros((len(_ORDERS), 4, 3))  # the signs of a command in each order, about each axis

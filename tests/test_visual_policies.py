@@ -182,7 +182,8 @@ def test_losses_take_a_policy_that_sees(recurrent, noise_correlation):
     env = forest(max_episode_steps=4)
     actor = actor_for(env, recurrent=recurrent, noise_correlation=noise_correlation, return_log_prob=True)
     value, qvalue = (make(env, in_keys=["observation", ("state", "position")]) for make in (make_value, make_qvalue))
-    rollout, _ = differentiable_rollout(env, actor, None, 6)
+    _, carry = differentiable_rollout(env, actor, None, 2)  # which begins with memories
+    rollout, _ = differentiable_rollout(env, actor, carry, 6)
     losses = [BPTTLoss(actor, alpha=0.1), SHACLoss(actor, value), ABPTLoss(actor, qvalue), SAPOLoss(actor, value)]
     for loss in losses:
         total = sum(x for key, x in loss(rollout).items() if key.startswith("loss_"))

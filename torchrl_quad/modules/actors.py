@@ -20,7 +20,18 @@ from torchrl.modules.tensordict_module.rnn import GRU
 from torchrl_quad.data.unwrap import check_env, leaf, observed
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.modules.networks import OBSERVATION, Activation, Cells, ScaleInit, first_action, network_of, policy_of
-from torchrl_quad.modules.plain import Network, PlainTanhGaussian, TanhGaussianActor, concatenated, is_pointwise, layout
+from torchrl_quad.modules.plain import (
+    Network,
+    PlainTanhGaussian,
+    Recall,
+    TanhGaussianActor,
+    concatenated,
+    gates_of,
+    gradient_before,
+    is_pointwise,
+    layout,
+    recalled_by,
+)
 from torchrl_quad.options import Below1, Entries, Entry, Field, Scale, Width, checked
 
 MEMORY = "recurrent_state"
@@ -317,9 +328,9 @@ class PlainParts(PlainTanhGaussian):
         written: dict[NestedKey, Tensor] = {}
         if self.memory:
             h = inputs[-1].squeeze(-2)
-            gates, new, own_new = _gates(x, h, *layers[-3:-1])
+            gates, new, own_new = gates_of(torch.addmm(layers[-3][1], x, layers[-3][0].t()), h, *layers[-2])
             kept += [gates, new, own_new]
-            recalled = _recalled(gates, new, h)
+            recalled = recalled_by(gates, new, h)
             written["next", MEMORY] = recalled.unsqueeze(-2)
             x = torch.cat((x, recalled), 1)
         kept.append(torch.addmm(layers[-1][1], x, layers[-1][0].t()))
@@ -345,14 +356,10 @@ class PlainParts(PlainTanhGaussian):
             h, (gates, new, own_new) = inputs[-1].squeeze(-2), kept[-4:-1]
             of_x, of_recalled = of_x.split([x.shape[1], h.shape[1]], 1)
             of_recalled = of_recalled + grads["next", MEMORY].squeeze(-2)
-            reset, keep = gates.chunk(2, 1)
-            of_new = (of_recalled - of_recalled * keep) * (1.0 - new * new)
-            of_both = torch.cat((of_new * own_new, of_recalled * (h - new)), 1) * ((1.0 - gates) * gates)
-            of_own_new, of_gates = of_new * reset, torch.cat((of_both, of_new), 1)
-            read, of_kept = [x, h, _recalled(gates, new, h)], [of_gates, of_own_new, grad]
+            of_gates, of_own_new, of_h = gradient_before(of_recalled, h, gates, new, own_new, layers[-2][0])
+            read, of_kept = [x, h, recalled_by(gates, new, h)], [of_gates, of_own_new, grad]
             of_x = of_x + of_gates @ layers[-3][0]
-            of_h = torch.cat((of_both, of_own_new), 1) @ layers[-2][0]
-            of_inputs = [(of_recalled * keep + of_h).unsqueeze(-2)]
+            of_inputs = [of_h.unsqueeze(-2)]
         before = [self._read(inputs, seen), *(x for x, _ in activated)]
         for i in reversed(range(len(activated))):
             (grad,) = activated[i][1](of_x)
@@ -365,6 +372,23 @@ class PlainParts(PlainTanhGaussian):
         if self.in_keys[0] not in self.without_gradient:
             (of_read[0],) = vjp(lambda image: self._see(weights, [image])[0], image)[1](of_seen)
         return [image, of_seen, *read, *of_kept], [*of_read, *of_inputs], grad_drawn
+
+    def recall(self, tensordict: TensorDictBase, horizon: int) -> tuple[Tensor, Tensor]:
+        """loc and scale (n horizon, k) in the states of a rollout, with gradients in the weights alone."""
+        keys = [*self.in_keys, *(["is_init"] if self.memory else []), *(["noise_before"] if self.rho else [])]
+        entries = {key: leaf(tensordict, key).detach().flatten(0, tensordict.ndim - 1) for key in keys}
+        inputs, layers = [entries[key] for key in self.in_keys], self._layers_of(self.weights)
+        x = self._read(inputs, self._see(self.weights, inputs))
+        for (weight, bias), activation in zip(layers, self.activations, strict=False):
+            x = activation(torch.addmm(bias, x, weight.t()))
+        if self.memory:
+            read = torch.addmm(layers[-3][1], x, layers[-3][0].t())
+            read, lasts = (y.unflatten(0, (-1, horizon)).transpose(0, 1) for y in (read, ~entries["is_init"]))
+            start = inputs[-1].squeeze(-2).unflatten(0, (-1, horizon))[:, 0]
+            recalled = Recall.apply(read, start, lasts.to(read), *layers[-2])
+            x = torch.cat((x, cast(Tensor, recalled).transpose(0, 1).flatten(0, 1)), 1)
+        raw = torch.addmm(layers[-1][1], x, layers[-1][0].t())
+        return self.head(raw, *(entries[key] for key in keys if key == "noise_before"))
 
     def weight_gradient(self, weights: Sequence[Tensor], traces: Sequence[Tensor]) -> list[Tensor]:
         """The gradients of all weights, over a batch."""
@@ -400,27 +424,6 @@ class PlainParts(PlainTanhGaussian):
         return concatenated([*seen, *inputs[self.sees : len(inputs) - len(self.memory)]], self.scales)
 
 
-def _gates(
-    x: Tensor, h: Tensor, of_input: tuple[Tensor, Tensor], of_memory: tuple[Tensor, Tensor]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The two gates of a GRU, for resets and to keep (n, 2k), the new memory, and the memory's share in it (n, k).
-
-    As in TorchRL's GRUModule. It reads x and the memory h by layers, each a weight and a bias.
-    """
-    size = 2 * h.shape[1]
-    (weight, bias), (own_weight, own_bias) = of_input, of_memory
-    own = torch.addmm(own_bias[:size], h, own_weight[:size].t())
-    own_new = torch.addmm(own_bias[size:], h, own_weight[size:].t())
-    gates, new = torch.addmm(bias, x, weight.t()).split([size, size // 2], 1)
-    gates = (gates + own).sigmoid()
-    return gates, (new + gates[:, : size // 2] * own_new).tanh(), own_new
-
-
-def _recalled(gates: Tensor, new: Tensor, h: Tensor) -> Tensor:
-    """What a GRU recalls (n, k)."""
-    return new + gates[:, h.shape[1] :] * (h - new)
-
-
 class Replay(PlainTanhGaussian):
     """A policy with eyes or memory in the states of a rollout that it flew, in which its memory is built up again."""
 
@@ -434,6 +437,9 @@ class Replay(PlainTanhGaussian):
         Single steps (n) that are no rollout are each remembered as they were flown.
         """
         has_time = tensordict.ndim > 1 or tensordict.names[-1] == "time"
+        if (parts := self.actor.parts()) is not None:
+            loc, scale = PlainParts(self.actor, parts).recall(tensordict, tensordict.shape[-1] if has_time else 1)
+            return loc.view(*tensordict.shape, -1), scale.view(*tensordict.shape, -1)
         with set_recurrent_mode(has_time):
             read = cast(TensorDictBase, self.actor.get_dist_params(tensordict.select(*self.actor.in_keys).detach()))
         return leaf(read, "loc"), leaf(read, "scale")

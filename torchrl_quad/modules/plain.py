@@ -13,6 +13,7 @@ from tensordict.nn import NormalParamExtractor, TensorDictSequential, dispatch
 from tensordict.nn.utils import biased_softplus
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.func import vjp
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
@@ -372,3 +373,70 @@ def is_pointwise(part: nn.Module) -> bool:
     if type(part).__module__ != "torch.nn.modules.activation" or isinstance(part, nn.RReLU):
         return False
     return not getattr(part, "inplace", False) and not part._parameters
+
+
+def gates_of(read: Tensor, h: Tensor, own_weight: Tensor, own_bias: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The two gates of a GRU, for resets and to keep (n, 2k), the new memory, and the memory's share in it (n, k).
+
+    As in TorchRL's GRUModule, from what its first layer returns of the input (n, 3k), and the memory h (n, k).
+    """
+    size = 2 * h.shape[1]
+    own = torch.addmm(own_bias[:size], h, own_weight[:size].t())
+    own_new = torch.addmm(own_bias[size:], h, own_weight[size:].t())
+    gates, new = read.split([size, size // 2], 1)
+    gates = (gates + own).sigmoid()
+    return gates, (new + gates[:, : size // 2] * own_new).tanh(), own_new
+
+
+def recalled_by(gates: Tensor, new: Tensor, h: Tensor) -> Tensor:
+    """What a GRU recalls (n, k)."""
+    return new + gates[:, h.shape[1] :] * (h - new)
+
+
+def gradient_before(
+    of_recalled: Tensor, h: Tensor, gates: Tensor, new: Tensor, own_new: Tensor, own_weight: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """From the gradient of what a GRU recalls (n, k) those of ``read`` and ``own_new`` of gates_of, and of h."""
+    reset, keep = gates.chunk(2, 1)
+    of_new = (of_recalled - of_recalled * keep) * (1.0 - new * new)
+    of_both = torch.cat((of_new * own_new, of_recalled * (h - new)), 1) * ((1.0 - gates) * gates)
+    of_own_new = of_new * reset
+    of_h = of_recalled * keep + torch.cat((of_both, of_own_new), 1) @ own_weight
+    return torch.cat((of_both, of_new), 1), of_own_new, of_h
+
+
+class Recall(torch.autograd.Function):
+    """What a GRU recalls (horizon, n, k), from what its first layer returns of its inputs (horizon, n, 3k).
+
+    It starts from a memory (n, k), and forgets where ``lasts`` (horizon, n, 1) is 0. A loop over autograd takes three
+    times as long.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, read: Tensor, h: Tensor, lasts: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """Keep each step's memory and gates."""
+        recalled, kept = [], []
+        for x, last in zip(read, lasts, strict=True):
+            h = h * last
+            gates, new, own_new = gates_of(x, h, weight, bias)
+            kept += [h, gates, new, own_new]
+            h = recalled_by(gates, new, h)
+            recalled.append(h)
+        ctx.save_for_backward(lasts, weight, *kept)
+        return torch.stack(recalled)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, of_recalled: Tensor) -> tuple[Tensor | None, ...]:  # pyrefly: ignore[bad-override]  # 1 output
+        """The gradients of ``read``, of the memory's weight and bias."""
+        lasts, weight, *kept = ctx.saved_tensors
+        of_h, of_read, of_own = torch.zeros_like(of_recalled[0]), [], []
+        for i in reversed(range(len(lasts))):
+            h, gates, new, own_new = kept[4 * i : 4 * i + 4]
+            of_gates, of_own_new, of_h = gradient_before(of_recalled[i] + of_h, h, gates, new, own_new, weight)
+            of_h = of_h * lasts[i]
+            of_read.append(of_gates)
+            of_own.append(of_own_new)
+        of_x, before = torch.stack(of_read[::-1]), torch.cat(kept[::4])
+        own = torch.cat((of_x[..., : 2 * before.shape[1]], torch.stack(of_own[::-1])), -1).flatten(0, 1)
+        return of_x, None, None, own.t() @ before, own.sum(0)

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 Found = dict[str, tuple[Any, str]]  # of a field: its value, None where there is none, and a note
 RPM = math.pi / 30.0  # [rad/s]
 READABLE = (
-    "These can be read: URDF, SDF, YAML of Flightmare and Agilicious, TOML of drone-models and Crazyflow, JSON of l2f "
+    "These can be read: URDF, SDF, YAML of Flightmare and Agilicious, JSON of VisFly, TOML of drone-models and Crazyflow, JSON of l2f "
     "(rl-tools) and of RotorPy's quad_params, and our own YAML and TOML."
 )
 AXES = ("xx", "yy", "zz", "xy", "xz", "yz")
@@ -66,6 +66,8 @@ class Said:
             array = presets.as_array(value)
         except (ValueError, RecursionError) as error:
             raise UserValueError(f"{self.source}: {name!r}: {one_line(error)}.") from None
+        if shape[:1] == (None,) and array.shape == shape[1:]:  # one for all rotors
+            array = array[None]
         if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
             want = ", ".join("n" if n is None else str(n) for n in shape)
             raise UserValueError(f"{self.source}: {name!r} has shape {array.shape}; it must be ({want}).")
@@ -153,24 +155,32 @@ def _flightmare(said: Said) -> Found:
     names = {"yaw_torque_coefficient": "kappa", "motor_time_constant": "motor_tau", "max_body_rate": "omega_max"}
     names |= {"rotor_speed_min": "motor_omega_min", "rotor_speed_max": "motor_omega_max"}
     found = said.fields(mass="mass", inertia="inertia", thrust_map="thrust_map", **names)
-    mass, speed, most, arm = found["mass"][0], found["rotor_speed_max"][0], said("thrust_max"), said("arm_l")
-    drags = [said("aero_coeff_1", 3), said("body_drag_1", 3), *(said(f"aero_coeff_{axis}_1") for axis in "xyz")]
-    if drags[2] is not None and drags[3] is not None:
-        drags.append(np.array([drags[2], drags[3], drags[4] or 0.0]))
-    found["linear_drag"] = next((x for x in drags if x is not None and x.ndim), None), ""
-    if found["thrust_map"][0] is None and most is not None and speed is not None:
+    mass, speed, most, curve = found["mass"][0], found["rotor_speed_max"][0], said("thrust_max"), found["thrust_map"][0]
+    arm = said("arm_length" if "linear_drag_coeffs" in said.data else "arm_l")  # of VisFly, or of Flightmare
+    drags = {name: said(name, 3) for name in ("aero_coeff_1", "body_drag_1", "linear_drag_coeffs")}
+    for name in ("aero_coeff_{}_1", "linear_drag_coeff_{}"):
+        x, y, z = (said(name.format(axis)) for axis in "xyz")
+        drags[name.format("x")] = None if x is None or y is None else np.array([x, y, z or 0.0])
+    drags = {name: x for name, x in drags.items() if x is not None}
+    named = next((name for name, x in drags.items() if x.any()), next(iter(drags), ""))  # zeros where all are
+    found["linear_drag"] = drags.get(named), named
+    if curve is None and most is not None and speed is not None:
         found["thrust_map"] = [most / speed**2, 0.0, 0.0], "from thrust_max at motor_omega_max, as the square of speed"
+    elif curve is not None and most is not None and speed is not None and speed_at(most, curve) < speed:
+        found["rotor_speed_max"] = speed_at(most, curve), "at thrust_max, before motor_omega_max"
+    if (squares := said("quad_drag_coeffs", 3)) is not None and (areas := said("cross_sections", 3)) is not None:
+        found["quadratic_drag"] = 0.5 * 1.225 * squares * areas, "of quad_drag_coeffs and cross_sections, in air"
     places = [said(f"tbm_{where}", 3) for where in ("fr", "bl", "br", "fl")]
     if all(x is not None for x in places):
         found |= placed(np.stack(places), note="front right, back left, back right, front left")
         found["rotor_spin"] = [-1, -1, 1, 1], "of Agilicious's allocation, not in the file"
     elif arm is not None:
         found |= placed(
-            arm * math.sqrt(0.5) * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]), note="arm_l at 45 degrees"
+            arm * math.sqrt(0.5) * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]), note="the arm at 45 degrees"
         )
         found["rotor_spin"] = [1, -1, 1, -1], "of Flightmare's allocation, not in the file"
         if found["inertia"][0] is None and mass is not None:
-            found["inertia"] = mass / 12.0 * arm**2 * np.array([4.5, 4.5, 7.0]), "of mass and arm_l, as in Flightmare"
+            found["inertia"] = mass / 12.0 * arm**2 * np.array([4.5, 4.5, 7.0]), "of mass and arm, as in Flightmare"
     return found
 
 
@@ -192,7 +202,7 @@ def _l2f(said: Said) -> Found:
     if times[0] is not None and times[1] is not None:
         found["motor_time_constant"] = same(np.stack(times, -1), "their time constants")
     if curves is not None and limit is not None and limit.size == 2:
-        scale, note = (1000.0, "of a throttle of 0 to 1, times 1000") if max(limit) <= 1.0 else (1.0, "")
+        scale, note = (1000.0, "of a throttle of 0 to 1, times 1000") if max(limit) <= 1.0 else (1.0, "taken as rad/s")
         curve, why = same(curves, "rotor_thrust_coefficients")
         found["thrust_map"] = (None, why) if curve is None else (curve[::-1] / [scale**2, scale, 1.0], note)
         found |= {f"rotor_speed_{end}": (scale * x, note) for end, x in zip(("min", "max"), sorted(limit), strict=True)}
@@ -200,9 +210,10 @@ def _l2f(said: Said) -> Found:
 
 
 def _drone_models(said: Said) -> Found:
-    found = said.fields(mass="mass", yaw_torque_coefficient="thrust2torque", motor_time_constant="thrust_tau")
+    lag = "rotor_tau" if "rotor_tau" in said.data else "thrust_tau"
+    found = said.fields(mass="mass", yaw_torque_coefficient="thrust2torque", motor_time_constant=lag)
     found |= diagonal(said("J", 3, 3))
-    arm, mix, gravity = said("L"), said("mixing_matrix", 3, None), said("gravity_vec", 3)
+    arm, mix, gravity, drag = said("L"), said("mixing_matrix", 3, None), said("gravity_vec", 3), said("drag_matrix", 3, 3)
     force, torque = said("rpm2thrust", 3), said("rpm2torque", 3)
     curve = None if force is None else force[::-1] / [RPM**2, RPM, 1.0]
     found["thrust_map"] = curve, ""
@@ -216,10 +227,16 @@ def _drone_models(said: Said) -> Found:
         if newton is not None and curve is not None:
             found[end] = speed_at(newton, curve), f"at {newton:g} N"
     mass = found["mass"][0]
-    known = curve is not None and not any(x is None for x in (mass, mix, torque))
-    if known and found["yaw_torque_coefficient"][0] is None:
-        powers = (speed_at(9.81 * mass / mix.shape[1], curve) / RPM) ** np.arange(3)
+    if drag is not None:
+        found.setdefault("linear_drag", (np.abs(np.diag(drag)), "drag_matrix"))
+    if curve is None or mass is None or mix is None:
+        return found
+    hover, lags = speed_at(9.81 * mass / mix.shape[1], curve) / RPM, said("rotor_dyn_coef", 4)
+    if torque is not None and found["yaw_torque_coefficient"][0] is None:
+        powers = hover ** np.arange(3)
         found["yaw_torque_coefficient"] = torque @ powers / (force @ powers), "rpm2torque per rpm2thrust, at hover"
+    if lags is not None and found["motor_time_constant"][0] is None:  # of speed and of its square, up and down
+        found["motor_time_constant"] = 1.0 / (lags[::2] + 2.0 * hover * lags[1::2]), "rotor_dyn_coef, about hover"
     return found
 
 
@@ -233,7 +250,7 @@ def _rotorpy(said: Said) -> Found:
     if all(x is not None for x in moments[:3]):
         found |= diagonal(symmetric(*(x or 0.0 for x in moments)))
     if all(x is not None for x in drag):
-        found["quadratic_drag"] = np.array(drag), ""
+        found["quadratic_drag"] = np.array(drag), "of each axis by itself; in RotorPy times the whole speed"
     if k2 is not None:
         found["thrust_map"] = [k2, 0.0, 0.0], ""
         found["yaw_torque_coefficient"] = (None if torque is None else torque / k2), "k_m per k_eta"
@@ -243,8 +260,8 @@ def _rotorpy(said: Said) -> Found:
 
 
 MAPPINGS: dict[str, tuple[Any, ...]] = {  # by kind: how it is read, and names that no other kind has
-    "Flightmare or Agilicious": (_flightmare, "tbm_fr", "arm_l", "motor_omega_max", "motor_tau"),
+    "Flightmare, Agilicious or VisFly": (_flightmare, "tbm_fr", "arm_l", "motor_omega_max", "motor_tau"),
     "l2f": (_l2f, "rotor_thrust_coefficients", "rotor_torque_directions"),
-    "drone-models": (_drone_models, "rpm2thrust", "mixing_matrix"),
+    "drone-models": (_drone_models, "rpm2thrust", "mixing_matrix", "gravity_vec"),
     "RotorPy": (_rotorpy, "k_eta", "rotor_pos"),
 }

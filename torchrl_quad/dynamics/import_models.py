@@ -28,7 +28,9 @@ from torchrl_quad.dynamics.import_formats import (
 )
 from torchrl_quad.errors import UserValueError, one_line, shown
 
-_NO_ROTOR = re.compile("guard|(quad|hexa|octo|multi)_?rotor")  # though its name holds one
+# What the name of a rotor's link says beside rotor, prop or motor, {}; and what it does not say.
+_ROTOR = r"{0}\D{{0,20}}\d|\d_?{0}|(left|right|front|rear|back).*{0}|{0}.*(left|right|front|rear|back)"
+_NO_ROTOR = re.compile("guard|(quad|hexa|octo|multi)_?rotor")
 DEPTH = 20  # of models, joints and frames within each other
 # Of each link: its mass, the frame of its centre of mass, its inertia there (NaN where nothing is said), and two
 # directions: of its z axis, and of the axis that it turns about.
@@ -45,6 +47,8 @@ def read_xml(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
     elif models:
         drone = max(models, key=lambda model: len([*model.iter("plugin"), *model.iter("include")]))  # not the ground
         _add_sdf(drone, np.eye(4), path, links, plugins)
+        if not links and root.find("world/include") is not None:
+            raise UserValueError(f"{path}: a world that includes its models. Give the file of the drone's own model.")
     else:
         raise UserValueError(
             f"{path}: XML with the root <{one_line(root.tag)}> is no URDF or SDF with a model. {READABLE}"
@@ -55,14 +59,22 @@ def read_xml(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
     short = {re.split("/|::", name)[-1]: name for name in links}
     rotors = [short.get(re.split("/|::", (x.findtext("linkName") or "").strip())[-1], "") for x in motors]
     for word in ("rotor", "prop", "motor"):
-        named = [x for x in links if re.search(rf"{word}\D{{0,20}}\d", x.lower())]
-        rotors = rotors or sorted((x for x in named if not _NO_ROTOR.search(x.lower())), key=_digits)
+        named = [x for x in short if re.search(_ROTOR.format(word), x.lower()) and not _NO_ROTOR.search(x.lower())]
+        rotors = rotors or [short[x] for x in sorted(named, key=_digits)]
     if "" in rotors:
         raise UserValueError(f"{path}: the linkName of a motor is that of no link with an <inertial>. Add it.")
     lifts = [x for x in plugins if "liftdrag" in re.sub(r"\W|_", "", x.get("filename", "").lower())]
     blades = {re.split("/|::", x)[-1] for x in rotors}
     if any(re.split("/|::", (x.findtext("link_name") or "").strip())[-1] not in blades for x in lifts):
         raise UserValueError(f"{path}: it has wings (LiftDrag), and a drone here has rotors alone. Take a multicopter.")
+    joints = {child: (parent, joint) for joint in root.iter("joint") for parent, child in [_ends(joint)]}
+    for rotor in blades & joints.keys():
+        above = joints[rotor][0]
+        for _ in range(DEPTH):
+            if above in joints and joints[above][1].get("type") != "fixed":
+                why = f"the joint {shown(joints[above][1].get('name'))} turns the rotor {shown(rotor)}"
+                raise UserValueError(f"{path}: {why}, and rotors here are fixed to the body. Take another drone.")
+            above = joints[above][0] if above in joints else ""
     found = _body(links, rotors, bool(motors)) | given
     _add_motors(found, motors, str(path), given)
     if (said := root.find("properties")) is not None and root.tag == "robot":
@@ -73,6 +85,13 @@ def read_xml(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
     return str(path), "URDF" if root.tag == "robot" else "SDF", found, []
 
 
+def _ends(joint: ET.Element) -> list[str]:
+    """The links that a joint of URDF or SDF joins, parent and child."""
+    ends = [joint.find(name) for name in ("parent", "child")]
+    names = ["" if x is None else x.get("link") or x.text or "" for x in ends]
+    return [re.split("/|::", name.strip())[-1] for name in names]
+
+
 def _digits(name: str | None) -> list[int]:
     return [int(x) for x in re.findall(r"\d+", name or "")]
 
@@ -80,6 +99,10 @@ def _digits(name: str | None) -> list[int]:
 def _xml(path: Path) -> ET.Element:
     text = read_text(path)
     text = text[max(text.find("<?xml"), 0) :]  # before which Gazebo allows comments
+    if re.match(r"\s*<(!doctype )?html", text.lower()):
+        raise UserValueError(f"{path}: this is a web page. Download the file itself, which GitHub calls raw.")
+    if re.search(r'<xacro:|"\$\{', text):
+        raise UserValueError(f"{path}: a template of xacro. Expand it first: xacro FILE > NEW_FILE.urdf.")
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # a few lines of which can mean billions of characters
         raise UserValueError(f"{path}: it declares entities or a type. Write the values out instead.")
     try:
@@ -178,6 +201,9 @@ def _add_sdf(
         inside[name] = place
     for link in model.iterfind("link"):
         if (inertial := link.find("inertial")) is not None:
+            if inertial.get("auto") in ("true", "1"):
+                why = f"Gazebo computes the inertia of the link {shown(link.get('name'))} from its shapes"
+                raise UserValueError(f'{path}: {why}. Write its <mass> and <inertia>, without auto="true".')
             mass, *moments = (
                 _numbers(inertial.findtext(x), 1, str(path))[0] for x in ("mass", *(f"inertia/i{a}" for a in AXES))
             )

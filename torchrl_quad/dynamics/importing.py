@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -65,8 +66,8 @@ def load_drone(
             dtype is none of floating point. What a file of another project lacks is named all at once.
         FileNotFoundError: the path does not exist.
     """
-    source, kind, found, _ = _read(drone, entry, fields)
-    found = _completed(source, kind, found, fields) if kind else found
+    source, kind, found, unread = _read(drone, entry, fields)
+    found = _completed(source, kind, found, fields, unread, entry) if kind else found
     return read_drone({k: v for k, (v, _) in found.items()} | fields, dtype, source)
 
 
@@ -74,8 +75,8 @@ def import_drone(path: str | Path, *, entry: str | None = None, **fields: Any) -
     """The YAML of a drone from a file of another project, with comments on all that the file does not say.
 
     It reads URDF, with the attributes of gym-pybullet-drones or the motors of RotorS; SDF, with Gazebo's motors or
-    without; YAML of Flightmare and Agilicious; TOML of drone-models and Crazyflow; JSON of l2f, and of RotorPy's
-    ``quad_params``. Frames become ours, and all links one rigid body with principal axes along x, y and z. Drag that
+    without; YAML of Flightmare and Agilicious; TOML of drone-models and Crazyflow; JSON of VisFly, of l2f, and of
+    RotorPy's ``quad_params``. Frames become ours, and all links one rigid body with principal axes along x, y and z. Drag that
     grows with rotor speed is that at hover. Only gains and limits of the rates are chosen where nobody says them.
 
     Args:
@@ -89,8 +90,10 @@ def import_drone(path: str | Path, *, entry: str | None = None, **fields: Any) -
     """
     source, kind, found, unread = _read(Path(path), entry, fields)
     if not kind:
-        raise UserValueError(f"{source} is no file of another project. {READABLE}")
-    found = _completed(source, kind, found, fields)
+        raise UserValueError(
+            f"{source} has fields of our own format, which load_drone reads, and no others that are known. {READABLE}"
+        )
+    found = _completed(source, kind, found, fields, unread, entry)
     name = one_line(Path(path).name + (f", {entry}" if entry else ""))
     text = [f"Source: {name} ({kind})."] + ([f"Not read: {', '.join(map(one_line, unread))}."] if unread else [])
     lines = [line for x in text for line in textwrap.wrap(x, 120, initial_indent="# ", subsequent_indent="# ")]
@@ -108,20 +111,24 @@ def _flow(value: Array) -> str:
     return f"{value:.7g}" if value.ndim == 0 else f"[{', '.join(f'{x:.7g}' for x in value)}]"
 
 
-def _completed(source: str, kind: str, found: Found, fields: Mapping[str, Any]) -> Found:
+def _completed(
+    source: str, kind: str, found: Found, fields: Mapping[str, Any], unread: Sequence[str], entry: str | None
+) -> Found:
     """What a file and a user say, and what is ours; an error names all that is missing."""
     known, found = found | usable(fields), found | {k: (v, GIVEN) for k, v in fields.items()}
     if missing := [name for name in ASKED if found.get(name, (None,))[0] is None]:
         why = [f": {found[x][1]}" if x in found and found[x][1] else "" for x in missing]
         names = ", ".join(f"{x} [{FIELDS[x]['unit'] or '1'}]{y}" for x, y in zip(missing, why, strict=True))
         like = ", ".join(f"{x}={y}" for x, y in _examples(known).items() if x in missing)
+        like = f"entry={entry!r}, {like}" if entry is not None else like
         raise UserValueError(
             f"{source} ({kind}) does not say {names}. Give your own numbers, in SI units and our frame, such as "
             f"load_drone({source!r}, {like}), or the same as arguments of recipes/import_drone.py."
         )
+    drags = [one_line(x) for x in unread if re.search("drag|aero", x)]
     ours = {
         "rotor_speed_min": (0.0, "assumed: rotors may stop"),
-        "quadratic_drag": ([0.0] * 3, "not in the file"),
+        "quadratic_drag": ([0.0] * 3, f"left out: {', '.join(drags)}" if drags else "not in the file"),
         "gravity": (9.81, "not in the file"),
     }
     found = ours | {k: v for k, v in found.items() if v[0] is not None}
@@ -160,6 +167,7 @@ def _examples(found: Found) -> dict[str, str]:
     most = ASKED["rotor_speed_max"] if curve is None else f"{speed_at(force, curve):.4g}"
     thrust = f"[{force / max(fast, 1.0) ** 2:.2g}, 0, 0]"
     examples = ASKED | {"rotor_spin": spin, "thrust_map": thrust, "rotor_speed_max": most}
+    examples["linear_drag"] = str([float(f"{0.3 * heavy:.2g}")] * 3)
     return {name: example.replace(" ", "") for name, example in examples.items()}  # one word of a command line
 
 
@@ -170,11 +178,11 @@ def _read(drone: Any, entry: str | None, fields: Mapping[str, Any]) -> tuple[str
         raise UserValueError(
             f"{drone}: a {suffix} file has to be run before its numbers can be read. {CONVERT[suffix]}"
         )
-    if suffix in (".urdf", ".sdf", ".xml", ".jinja"):
+    if suffix in (".urdf", ".sdf", ".world", ".xml", ".jinja"):
         return read_xml(Path(drone), usable(fields))
     if suffix == ".json":
         source, data = str(drone), read_json(Path(drone))
-    elif isinstance(drone, Path) and suffix not in ("", ".yaml", ".yml", ".toml"):
+    elif suffix not in ("", ".yaml", ".yml", ".toml") and Path(drone).is_file():
         raise UserValueError(f"{drone}: no drone can be read from a {suffix} file. {READABLE}")
     else:
         source, data = read_fields(drone)
@@ -189,7 +197,8 @@ def _read(drone: Any, entry: str | None, fields: Mapping[str, Any]) -> tuple[str
     if (entry is None and len(drones) > 1) or (entry is not None and entry not in drones):
         names = f"entry={next(iter(drones))!r} or another of {shown(list(drones))}"
         raise UserValueError(f"{source}: choose one drone of the file, by {names}; got {shown(entry)}.")
-    if not drones and not (isinstance(data, Mapping) and set(FIELDS) & set(data)) and not isinstance(drone, Mapping):
+    own = set(FIELDS) & set(data) if isinstance(data, Mapping) else set()
+    if not drones and not isinstance(drone, Mapping) and 2 * len(own) <= len(data):  # others, too, say "mass"
         raise UserValueError(f"{source}: this file is of no kind that is known. {READABLE}")
     if not drones:
         return source, "", {k: (v, "") for k, v in data.items()}, []

@@ -1,0 +1,285 @@
+"""Drones from files of other projects, and what is said of those that cannot become ours."""
+
+import json
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from refusals import cases, refuses
+
+from torchrl_quad import HoveringEnv, load_drone
+from torchrl_quad.dynamics import import_drone
+
+MOTOR = {"timeConstantUp": 0.0125, "timeConstantDown": 0.025, "maxRotVelocity": 1000, "momentConstant": 0.02}
+MOTOR |= {"motorConstant": 1e-5, "rotorDragCoefficient": 1e-4}
+CORNERS = ((0.2, -0.1), (-0.2, 0.1), (0.2, 0.1), (-0.2, -0.1))
+J = "<inertia><ixx>0.01</ixx><iyy>0.02</iyy><izz>0.025</izz></inertia>"
+
+
+def sdf(content):
+    return f"<sdf version='1.9'><model name='x'>{content}</model></sdf>"
+
+
+def motors(**changes):
+    """Of an SDF: of four rotors, the first of which may differ."""
+    turns = ({"turningDirection": x} for x in ("ccw", "ccw", "cw", "cw"))
+    said = [MOTOR | {"linkName": f"rotor_{i}", "motorNumber": i} | x for i, x in enumerate(turns)]
+    said[0] |= changes
+    return "".join(f"<plugin>{''.join(f'<{k}>{v}</{k}>' for k, v in x.items())}</plugin>" for x in said)
+
+
+FRAME = f"<link name='base_link'><inertial><mass>1</mass>{J}</inertial></link>" + "".join(
+    f"<joint name='j{i}'><pose relative_to='base_link'>{x} {y} 0.1 0 0 0</pose></joint><link name='rotor_{i}'>"
+    f"<pose relative_to='j{i}'/><inertial><mass>0.25</mass></inertial></link>"
+    for i, (x, y) in enumerate(CORNERS)
+)
+URDF = (
+    "<robot name='{}'><properties kf='1e-9' km='2e-11' thrust2weight='2' drag_coeff_xy='1e-6'/><link name='base_link'>"
+    "<inertial><mass value='0.4'/><inertia ixx='1e-3' ixy='{}' iyy='1e-3' izz='1.5e-3'/></inertial></link>"
+    + "".join(
+        f"<link name='prop{i}_link'><inertial><origin xyz='{CORNERS[k][0]} {CORNERS[k][1]} 0'/></inertial></link>"
+        for i, k in enumerate((0, 3, 1, 2))
+    )
+    + "</robot>"
+)
+L2F = {"mass": 1.0, "gravity": [0, 0, 9.8], "J": np.diag([0.01, 0.01, 0.015]).tolist(), "action_limit": [0, 1]}
+L2F |= {"rotor_positions": [[x, -y, 0] for x, y in CORNERS], "rotor_thrust_directions": [[0, 0, -1]] * 4}  # z is down
+L2F |= {"rotor_torque_directions": [[0, 0, x] for x in (1, 1, -1, -1)], "rotor_torque_constants": [0.02] * 4}
+L2F |= {"rotor_thrust_coefficients": [[0.1, 0.5, 5.0]] * 4, "rotor_time_constants_rising": [0.03] * 4}
+L2F |= {"rotor_time_constants_falling": [0.06] * 4}
+HEXAGON = [[0.2 * np.cos(x), 0.2 * np.sin(x), 0.0] for x in np.arange(6) * np.pi / 3]
+ROTORPY = {
+    "mass": 1.0,
+    "Ixx": 0.01,
+    "Iyy": 0.01,
+    "Izz": 0.015,
+    "rotor_pos": {f"r{i}": x for i, x in enumerate(HEXAGON)},
+}
+ROTORPY |= {"rotor_directions": [1, -1] * 3, "k_eta": 1e-5, "k_m": 2e-7, "k_d": 1e-4, "k_z": 2e-4, "tau_m": 0.02}
+ROTORPY |= {"rotor_speed_min": 0, "rotor_speed_max": 900, "c_Dx": 0.01, "c_Dy": 0.01, "c_Dz": 0.02}
+MODELS = {"mass": 0.03, "L": 0.03, "J": np.diag([1e-5, 1e-5, 1.9e-5]).tolist(), "thrust_tau": 0.05, "thrust_max": 0.12}
+MODELS |= {"rpm2thrust": [0, 0, 4e-10], "rpm2torque": [0, 0, 8e-12]}
+MODELS |= {"mixing_matrix": [[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]]}
+TOML = "\n".join(f"[{x}]\n" + "\n".join(f"{k} = {v}" for k, v in MODELS.items()) for x in "ab")
+HOVER_RPM = np.sqrt(0.03 * 9.81 / 4 / 4e-10)
+CRAZYFLOW = (
+    "[cf]\n"
+    + "\n".join(f"{k} = {v}" for k, v in MODELS.items() if k != "thrust_tau")
+    + "
+rotor_dyn_coef = [10.0, 1e-4, 0.0, 2e-4]
+drag_matrix = [[-0.02, 0, 0], [0, -0.02, 0], [0, 0, -0.03]]"
+)
+VISFLY = {"mass": 0.46, "inertia": [0.00101, 0.00153, 0.00203], "arm_length": 0.075, "kappa": 0.016, "motor_tau": 0.033}
+VISFLY |= {"quad_drag_coeffs": [0.5] * 3, "linear_drag_coeffs": [0.005, 0.005, 0.00575], "motor_omega_max": 3500}
+VISFLY |= {
+    "cross_sections": [0.01, 0.01, 0.03],
+    "thrust_map": [4.0426e-7, 2.5583e-5, -0.026215],
+    "motor_omega_min": 200,
+}
+AGILICIOUS = {"mass": 0.75, "tbm_fr": [0.2, -0.1, 0], "tbm_bl": [-0.2, 0.1, 0], "tbm_br": [-0.2, -0.1, 0]}
+AGILICIOUS |= {"tbm_fl": [0.2, 0.1, 0], "inertia": [0.0025, 0.0021, 0.0043], "motor_omega_min": 150, "motor_tau": 0.033}
+AGILICIOUS |= {"motor_omega_max": 2000, "kappa": 0.022, "thrust_max": 8, "aero_coeff_1": [0.1, 0.1, 0.2]}
+AGILICIOUS |= {"omega_max": [10, 10, 4]}
+FLIGHTMARE = "quadrotor_dynamics: {mass: 0.73, arm_l: 0.17, thrust_map: [1.3e-6, 0, 0], kappa: 0.016, motor_tau: 0.03}"
+TILTING = "<joint name='k' type='fixed'><parent>arm</parent><child>x::rotor_0</child></joint>"
+TILTING += "<joint name='tilt' type='revolute'><parent>base_link</parent><child>arm</child></joint>"
+HOVER, FAST = np.sqrt(9.81 * 2 / 4 / 1e-5), 2 * np.pi / 60  # of a rotor of the SDF [rad/s]; of one rpm
+
+
+@cases(
+    ("x.sdf", sdf(FRAME + motors()), {}, {"mass": 2.0, "inertia": [0.025, 0.065, 0.075],
+     "rotor_positions": CORNERS, "rotor_spin": [-1, -1, 1, 1], "motor_time_constant": [0.0125, 0.025],
+     "thrust_map": [1e-5, 0, 0], "linear_drag": [4e-4 * HOVER, 4e-4 * HOVER, 0]}),
+    ("x.urdf", URDF.format("racer", 0), {"motor_time_constant": 0.05}, {
+     "rotor_positions": [CORNERS[i] for i in (0, 3, 1, 2)],
+     "rotor_spin": [1, -1, 1, -1], "thrust_map": [1e-9 / FAST**2, 0, 0], "yaw_torque_coefficient": 0.02,
+     "rotor_speed_max": np.sqrt(2 * 0.4 * 9.81 / 4e-9) * FAST, "motor_time_constant": 0.05}),
+    ("x.json", json.dumps({"dynamics": L2F}), {"linear_drag": [0.1] * 3}, {"rotor_positions": CORNERS, "gravity": 9.8,
+     "rotor_spin": [-1, -1, 1, 1], "thrust_map": [5e-6, 5e-4, 0.1], "motor_time_constant": [0.03, 0.06]}),
+    ("x.json", json.dumps(ROTORPY), {}, {"rotor_positions": np.array(HEXAGON)[:, :2], "rotor_spin": [1, -1] * 3,
+     "yaw_torque_coefficient": 0.02, "quadratic_drag": [0.01, 0.01, 0.02],
+     "linear_drag": 6 * np.sqrt(9.81 / 6e-5) * np.array([1e-4, 1e-4, 2e-4])}),
+    ("x.toml", TOML, {"entry": "b", "linear_drag": [0.01] * 3}, {"rotor_spin": [-1, 1, -1, 1], "mass": 0.03,
+     "rotor_positions": 0.03 * np.array([[1, -1], [-1, -1], [-1, 1], [1, 1]]),
+      "yaw_torque_coefficient": 0.02, "rotor_speed_max": np.sqrt(0.12 / 4e-10) * FAST}),
+    ("x.yaml", json.dumps(AGILICIOUS), {}, {"rotor_positions": [CORNERS[i] for i in (0, 1, 3, 2)],
+     "rotor_spin": [-1, -1, 1, 1], "thrust_map": [2e-6, 0, 0], "max_body_rate": [10, 10, 4],
+     "linear_drag": [0.1, 0.1, 0.2]}),
+    ("x.yaml", FLIGHTMARE, {"linear_drag": [0.1] * 3, "rotor_speed_max": 3000}, {"rotor_spin": [1, -1, 1, -1],
+     "inertia": [0.00791138, 0.00791138, 0.01230658]}),
+    ("x.yaml", json.dumps(AGILICIOUS | {"aero_coeff_1": [0, 0, 0], "thrust_map": [5e-6, 0, 0]} | dict.fromkeys(
+     ("linear_drag_coeff_x", "linear_drag_coeff_y", "linear_drag_coeff_z"), 0.3)), {},
+     {"linear_drag": [0.3] * 3, "rotor_speed_max": np.sqrt(8 / 5e-6), "thrust_map": [5e-6, 0, 0]}),
+    ("x.json", json.dumps(VISFLY), {}, {name: getattr(load_drone("visfly"), name).squeeze() for name in (
+     "mass", "inertia", "rotor_spin", "thrust_map", "linear_drag", "quadratic_drag")}),
+    ("x.json", json.dumps({"dynamics": {**L2F, "rotor_thrust_coefficients": [0.1, 0.5, 5.0]}}),
+     {"linear_drag": [0.1] * 3}, {"thrust_map": [5e-6, 5e-4, 0.1]}),
+    ("x.toml", CRAZYFLOW, {}, {"linear_drag": [0.02, 0.02, 0.03], "motor_time_constant": [
+     1 / (10 + 2e-4 * HOVER_RPM), 1 / (4e-4 * HOVER_RPM)]}),
+)  # fmt: skip
+def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_theirs(
+    file, text, given, wanted, tmp_path
+):
+    path = tmp_path / file
+    path.write_text(text)
+    drone = load_drone(path, torch.float64, **given)
+    for name, value in wanted.items():
+        np.testing.assert_allclose(getattr(drone, name).squeeze(), np.asarray(value, float), rtol=1e-5, err_msg=name)
+    written = tmp_path / "ours.yaml"
+    written.write_text(import_drone(path, **given))
+    for name, value in load_drone(written, torch.float64).fields().items():
+        torch.testing.assert_close(value, getattr(drone, name), rtol=1e-6, atol=1e-12)
+    assert written.read_text().startswith(f"# Source: {file}") and "chosen here: suggest_gains" in written.read_text()
+    assert all(
+        f"{x}: " in written.read_text() and "given, not in the file" in written.read_text()
+        for x in given
+        if x != "entry"
+    )
+    assert HoveringEnv(num_envs=1, drone=str(written)).nominal.mass.item() == pytest.approx(drone.mass.item())
+
+
+@cases(
+    (
+        "x.sdf",
+        sdf(FRAME),
+        r"does not say rotor_spin \[1\], yaw_torque_coefficient \[m\], thrust_map .*, motor_time_constant",
+    ),
+    (
+        "x.urdf",
+        URDF.format("cf", 0),
+        r"\(URDF.*\) does not say motor_time_constant \[s\]. Give .*motor_time_constant=0.03\)",
+    ),
+    ("x.urdf", URDF.format("cf", 4e-4), r"inertia \[kg m2\]: its products of inertia are not small, 0.0004 kg m2"),
+    ("x.sdf", sdf(FRAME + motors(motorConstant=2e-5)), "rotors differ in motorConstant"),
+    ("x.sdf", sdf(FRAME.replace(J, "") + motors()), "inertia .*: the link 'base_link' has a mass and no <inertia>"),
+    ("x.sdf", sdf(FRAME + motors() + "<plugin filename='gz-sim-lift-drag'/>"), r"it has wings \(LiftDrag\)"),
+    ("x.sdf", sdf("<include><placement_frame>a</placement_frame></include>"), "a placement_frame is not read"),
+    (
+        "x.sdf",
+        sdf(FRAME.replace("'j0'/>", "'j9'/>")),
+        "a pose is relative to 'j9', which is no link",
+    ),
+    (
+        "x.sdf",
+        sdf(FRAME.replace("0.1 0 0 0<", "0.1 3.141592654 0 0<") + motors()),
+        r"x.sdf: to hover, .*let rotor_direction point up",
+    ),
+    ("x.urdf", URDF.format("cf", 0).replace("'prop", "'w"), "rotor_positions .* no link with an <inertial> is named"),
+    (
+        "x.json",
+        json.dumps({**ROTORPY, "mass": None}),
+        "mass .*, linear_drag .*: it follows from the drag of the rotors",
+    ),
+    ("x.sdf", sdf("<include><uri>model://other</uri></include>"), "includes the model 'model://other': put it at "),
+    ("x.urdf", "<!DOCTYPE x [<!ENTITY a 'b'>]><robot>&a;</robot>", "declares entities or a type"),
+    ("x.sdf", sdf(FRAME.replace("0.02<", "much<")), "expected 1 number, got 'much'"),
+    ("x.xml", "<mujoco/>", "XML with the root <mujoco> is no URDF or SDF .* These can be read: URDF"),
+    ("x.json", "[1]", "this file is of no kind that is known. These can be read"),
+    (
+        "x.json",
+        json.dumps({"dynamics": {**L2F, "rotor_positions": [1, 2]}}),
+        r"'rotor_positions' has shape \(2,\); it must be",
+    ),
+    ("x.toml", TOML, r"choose one drone of the file, by entry='a' or another of"),
+    ("x.xacro", "", "a .xacro file has to be run before its numbers can be read. Expand it first"),
+    ("x.toml", "[cf2x]\nacc_coef = 1", "this file is of no kind that is known. These can be read"),
+    ("x.stl", "", "no drone can be read from a .stl file. These can be read"),
+    ("x.yaml", "mass: 1", "has fields of our own format, which load_drone reads, and no others"),
+    ("x.yaml", "{mass: 1, arm_length: 0.2, TWR_max: 5, omega_max_xy: 9}", "this file is of no kind that is known"),
+    ("x.toml", "[cf]\nmass = 0.03\ngravity_vec = [0, 0, -9.81]", "drone-models.* does not say inertia"),
+    ("x.usd", "", "no drone can be read from a .usd file. These can be read"),
+    ("x.urdf", "<robot><xacro:include/></robot>", "a template of xacro. Expand it first: xacro FILE"),
+    ("x.urdf", URDF.format("cf", 0).replace("'1e-3'", '"${j}"'), "a template of xacro"),
+    ("x.sdf", "<!DOCTYPE html><html></html>", "this is a web page. Download the file itself"),
+    ("x.world", "<sdf><world><include/><model name='ground'/></world></sdf>", "Give the file of the drone's own model"),
+    ("x.sdf", sdf(FRAME.replace("<inertial>", "<inertial auto='true'>", 1)), "computes the inertia of the link 'base"),
+    ("x.sdf", sdf(FRAME + motors() + TILTING), "the joint 'tilt' turns the rotor 'rotor_0', and rotors here are fixed"),
+)
+def test_what_cannot_become_a_drone_is_refused_with_all_that_is_missing(file, text, message, tmp_path):
+    (tmp_path / file).write_text(text)
+    refuses(message, import_drone, tmp_path / file)
+
+
+def test_parts_of_a_model_stand_where_its_simulator_puts_them(tmp_path):
+    """A payload 0.2 m below the body, which is written in several ways; frames of masses turn no rotor."""
+    given = {"yaw_torque_coefficient": 0.02}
+    load = "<link name='load'><pose relative_to='{}'>0 0 {} 0 0 0</pose><inertial><mass>1</mass>" + J
+    load += "</inertial></link>"
+    turned = FRAME.replace("<inertial><mass>0.25<", "<inertial><pose>0 0 0 0 0.2 0</pose><mass>0.25<")
+    (tmp_path / "frame").mkdir()
+    (tmp_path / "frame/model.sdf").write_text(sdf("<pose>0 0 0.24 0 0 0</pose>" + FRAME))
+    include = "<include{}><uri>{}</uri>{}</include>"
+    ways = (
+        FRAME + load.format("base_link", -0.2),
+        turned + load.format("__model__", -0.2),
+        include.format(" merge='true'", "model://frame/", "") + load.format("base_link", -0.2),
+        include.format("", "https://host/1.0/owner/models/frame/3", "<name>v</name>") + load.format("v", 0.04 - 0.24),
+        include.format("", "file://frame/model.sdf", "<pose>0 0 1 0 0 0</pose>") + load.format("x::base_link", -0.2),
+        f"<model name='m'><pose>0 0 3 0 0 0</pose>{FRAME}</model>" + load.format("m::base_link", -0.2),
+        FRAME + "<plugin filename='gz-sim-lift-drag'><link_name>x::rotor_0</link_name></plugin>"
+        "<frame name='f' attached_to='base_link'><pose degrees='true'>0.2 0.5 0 0 0 90</pose></frame>"
+        + load.format("f", -0.2).replace("0 0 -0.2 0 0 0", "-0.5 0.2 -0.2 0 0 -1.5707963"),
+        f"<model name='m'><pose>1 0 3 0 0 3.14159265</pose>{FRAME}</model><frame name='g' attached_to='m::base_link'/>"
+        + load.format("g", -0.2),
+    )
+    for i, way in enumerate(ways):
+        (tmp_path / f"{i}").mkdir()
+        (tmp_path / f"{i}/MODEL.SDF").write_text(sdf(way + motors()))
+        drone = load_drone(tmp_path / f"{i}/MODEL.SDF", torch.float64, **given)
+        height = 2 * 1 / 3 * (0.2 + 0.05) ** 2  # of the other 2 kg, whose centre is 5 cm above the body
+        np.testing.assert_allclose(drone.inertia, [0.035 + height, 0.085 + height, 0.1], atol=1e-6, err_msg=way)
+        assert drone.rotor_direction is None
+
+
+def test_rotors_are_found_by_their_names_and_axes_and_what_follows_from_a_given_mass_follows(tmp_path):
+    flat = URDF.format("cf", 0).replace("'prop", "'motor")
+    guards = "".join(f"<link name='prop_guard_{i}'><inertial/></link>" for i in range(4))
+    turned = "".join(
+        f"<joint name='j{i}' type='continuous'><parent link='base_link'/><child link='motor{i}_link'/>"
+        f"<origin rpy='1.5707963 0 0'/><axis xyz='0 {-2 if i else 1} 0'/></joint>"
+        for i in range(4)
+    )
+    guards += "<link name='rotor_0_guard'><inertial/></link>"
+    guarded = flat.replace("base_link", "quad_rotor1_base").replace("</robot>", guards + "</robot>")
+    (tmp_path / "x.urdf").write_text(guarded)
+    wanted = load_drone(tmp_path / "x.urdf", torch.float64, motor_time_constant=0.05)
+    assert "of motor0_link, motor1_link" in import_drone(tmp_path / "x.urdf", motor_time_constant=0.05)
+    for names in ("front_left front_right back_left back_right", "/m1 /m2 /m3 /m4"):  # as other projects write them
+        renamed = flat
+        for i, name in enumerate(names.split()):
+            renamed = renamed.replace(f"motor{i}_link", f"quadrotor{name}_prop" if "/" in name else f"{name}_prop")
+        (tmp_path / "z.urdf").write_text(renamed)
+        named = load_drone(tmp_path / "z.urdf", torch.float64, motor_time_constant=0.05)
+        torch.testing.assert_close(named.rotor_positions, wanted.rotor_positions)
+    lying = flat.replace("<origin xyz='0.2 -0.1 0'", "<origin xyz='0.2 0 0.1'").replace("</robot>", turned + "</robot>")
+    (tmp_path / "y.URDF").write_text(lying)
+    upright = load_drone(tmp_path / "y.URDF", torch.float64, motor_time_constant=0.05)
+    assert upright.rotor_direction is None
+    heavy = load_drone(tmp_path / "x.urdf", torch.float64, motor_time_constant=0.05, mass=1.6)
+    torch.testing.assert_close(heavy.linear_drag, 2.0 * wanted.linear_drag)  # rotors turn twice as fast to carry it
+    torch.testing.assert_close(heavy.rotor_speed_max, 2.0 * wanted.rotor_speed_max)
+    more = {"thrust_map": (4.0 * wanted.thrust_map).tolist(), "motor_time_constant": 0.05}
+    strong = load_drone(tmp_path / "x.urdf", torch.float64, **more)
+    torch.testing.assert_close(2.0 * strong.rotor_speed_max, wanted.rotor_speed_max)  # by the file's thrust2weight
+
+
+def test_the_recipe_writes_a_drone_from_a_model_and_what_it_includes(tmp_path, monkeypatch, capsys):
+    script = Path(__file__).parents[1] / "recipes/import_drone.py"
+    (tmp_path / "frame.sdf").write_text(sdf(FRAME))
+    (tmp_path / "x.sdf").write_text(sdf(f"<include><uri>model://frame</uri></include>{motors()}"))
+    monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "x.sdf"), "mass=3", f"output={tmp_path}/o/x.yaml"])
+    runpy.run_path(str(script), run_name="__main__")
+    assert load_drone(tmp_path / "o/x.yaml").mass == 3.0 and f"env.drone={tmp_path}/o/x.yaml" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "frame.sdf")])
+    with pytest.raises(SystemExit):
+        runpy.run_path(str(script), run_name="__main__")
+    advice = re.search(r"load_drone\(.*\)(?=, or)", capsys.readouterr().err)[0]
+    assert HoveringEnv(num_envs=1, drone=eval(advice)).nominal.mass.item() == 2.0
+    (tmp_path / "x.toml").write_text(TOML)
+    with pytest.raises(ValueError, match="entry='b', linear_drag=") as refused:
+        load_drone(tmp_path / "x.toml", entry="b")
+    assert eval(re.search(r"load_drone\(.*\)(?=, or)", str(refused.value))[0]).mass.item() == pytest.approx(0.03)

@@ -69,9 +69,7 @@ HOVER_RPM = np.sqrt(0.03 * 9.81 / 4 / 4e-10)
 CRAZYFLOW = (
     "[cf]\n"
     + "\n".join(f"{k} = {v}" for k, v in MODELS.items() if k != "thrust_tau")
-    + "
-rotor_dyn_coef = [10.0, 1e-4, 0.0, 2e-4]
-drag_matrix = [[-0.02, 0, 0], [0, -0.02, 0], [0, 0, -0.03]]"
+    + "\nrotor_dyn_coef = [10.0, 1e-4, 0.0, 2e-4]\ndrag_matrix = [[-0.02, 0, 0], [0, -0.02, 0], [0, 0, -0.03]]"
 )
 VISFLY = {"mass": 0.46, "inertia": [0.00101, 0.00153, 0.00203], "arm_length": 0.075, "kappa": 0.016, "motor_tau": 0.033}
 VISFLY |= {"quad_drag_coeffs": [0.5] * 3, "linear_drag_coeffs": [0.005, 0.005, 0.00575], "motor_omega_max": 3500}

@@ -257,6 +257,20 @@ def test_tracks_of_other_projects_are_read_and_what_was_assumed_is_said(tmp_path
         assert [gate["position"] for gate in isaac["gates"]] == [[0, 0, 0.9], [4, 0, 1.9]]
     (tmp_path / "free.toml").write_text("\ufeff" + LSY.replace("obstacles = [{pos = [1.0, 0.75, 1.5]}]", ""))
     assert "scene" not in load_track(tmp_path / "free.toml")
+    # The newest files have an order of passages, which may go backwards, and the oldest no limits and other words.
+    gates = [{"pos": [x, 0, 1], "rpy": [0, 0, 0]} for x in (0, 2, 4)]
+    own = {"gates": gates, "gate_order": [3, -1, 3], "drone": {"pos": [-1, 0, 0]}}
+    spread = {"gate_pos": {"type": "uniform", "low": -0.1, "high": [0.1, 0.3, 0.1]}}
+    ordered = load_track({"env": {"track": own}, "box": [[-5, -5, 0], [5, 5, 3]]})
+    assert [gate["position"][0] for gate in ordered["gates"]] == [4, 0, 4] and ordered["box"][1] == [5, 5, 3]
+    ways = forward(torch.tensor([gate["rotation"] for gate in ordered["gates"]]))[:, 0].tolist()
+    assert ways == pytest.approx([1, -1, 1])
+    old = {"env": {"track": {**own, "gate_order": [1, 2, 3]}, "randomization": spread}, "box": [[-5, -5, 0], [5, 5, 3]]}
+    assert load_track(old)["position_jitter"] == pytest.approx([0.1, 0.2, 0.1])
+    old["env"]["track"] = own
+    refuses("passes a gate twice, and gates are moved at random", load_track, old)
+    refuses(r"does not say safety_limits. Give box=", load_track, {"env": {"track": own}})
+    refuses("names gates from 1 to 3; got .0, 1.", load_track, {**old, "env": {"track": {**own, "gate_order": [0, 1]}}})
 
 
 AGILE = {"start_pos": [-5, 0, 2], "goal_pos": [8, 0, 2]}
@@ -279,7 +293,7 @@ SQUARE = {"position": [0, 0, 2], "yaw": 0.0, **OPEN}
     ({"gates": [[0, 0, 1], [1, 1, 1]], "frame": 0.1}, {}, "frame is of gates with a direction; these are points"),
     ({"random": {"gates": 3, "turn": 2.0}}, {"radius": 1.0}, "3 gates need a turn of at least 2.09 rad, got 2"),
     ({"random": {"spacing": [4, 2]}}, {"radius": 1.0}, "spacing and heights are the least and then the greatest"),
-    ({"env": {"track": {"gates": []}}}, {}, "track: cannot be read .*: it does not say 'drones'"),
+    ({"env": {"track": {"gates": []}}}, {}, "track: cannot be read .*: it does not say 'drone'"),
     ({"goal_pos": [8, 0, 2], "gates": ROW}, {}, r"does not say start_pos. Give load_track\(..., start_pos=\[x, y, z\]"),
     ({**AGILE, "gates": {"Start": ROW["Gate1"], **ROW}}, {}, "The name of gate 'Start' has no number. Number them"),
     ({"gates": [{**SQUARE, "position": 5}, SQUARE]}, {}, "gates must be a list of points .* got .5, .0, 0, 2.."),

@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 Found = dict[str, tuple[Any, str]]  # of a field: its value, None where there is none, and a note
 RPM = math.pi / 30.0  # [rad/s]
 READABLE = (
-    "These can be read: URDF, SDF, YAML of Flightmare and Agilicious, JSON of VisFly, TOML of drone-models and Crazyflow, JSON of l2f "
-    "(rl-tools) and of RotorPy's quad_params, and our own YAML and TOML."
+    "These can be read: URDF, SDF, YAML of Flightmare and Agilicious, TOML of drone-models and Crazyflow, JSON of "
+    "VisFly, of l2f (rl-tools) and of RotorPy's quad_params, and our own YAML and TOML."
 )
 AXES = ("xx", "yy", "zz", "xy", "xz", "yz")
 GIVEN = "given, not in the file"
@@ -213,7 +213,12 @@ def _drone_models(said: Said) -> Found:
     lag = "rotor_tau" if "rotor_tau" in said.data else "thrust_tau"
     found = said.fields(mass="mass", yaw_torque_coefficient="thrust2torque", motor_time_constant=lag)
     found |= diagonal(said("J", 3, 3))
-    arm, mix, gravity, drag = said("L"), said("mixing_matrix", 3, None), said("gravity_vec", 3), said("drag_matrix", 3, 3)
+    arm, mix, gravity, drag = (
+        said("L"),
+        said("mixing_matrix", 3, None),
+        said("gravity_vec", 3),
+        said("drag_matrix", 3, 3),
+    )
     force, torque = said("rpm2thrust", 3), said("rpm2torque", 3)
     curve = None if force is None else force[::-1] / [RPM**2, RPM, 1.0]
     found["thrust_map"] = curve, ""

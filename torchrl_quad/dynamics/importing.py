@@ -76,8 +76,9 @@ def import_drone(path: str | Path, *, entry: str | None = None, **fields: Any) -
 
     It reads URDF, with the attributes of gym-pybullet-drones or the motors of RotorS; SDF, with Gazebo's motors or
     without; YAML of Flightmare and Agilicious; TOML of drone-models and Crazyflow; JSON of VisFly, of l2f, and of
-    RotorPy's ``quad_params``. Frames become ours, and all links one rigid body with principal axes along x, y and z. Drag that
-    grows with rotor speed is that at hover. Only gains and limits of the rates are chosen where nobody says them.
+    RotorPy's ``quad_params``. Frames become ours, and all links one rigid body with principal axes along x, y and z.
+    Drag that grows with rotor speed is that at hover. Only gains and limits of the rates are chosen where nobody says
+    them.
 
     Args:
         path: of that file.

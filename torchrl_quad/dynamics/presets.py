@@ -41,6 +41,10 @@ def read(kind: str, preset: str | Path | Mapping, folder: Traversable | None = N
         source, path = f"{preset}.yaml", known[preset]
     elif isinstance(preset, Path) or (isinstance(preset, str) and preset.lower().endswith((".yaml", ".yml", ".toml"))):
         source, path = str(preset), Path(preset)
+    elif isinstance(preset, str) and Path(preset).is_file():
+        raise UserValueError(
+            f"{preset}: a {kind} is read from YAML or TOML, and this is neither. Write its numbers so."
+        )
     else:
         raise UserValueError(f"Unknown {kind} {shown(preset)}. {choices} the path of a .yaml file, or a mapping.")
     if not path.is_file():  # which a pipe or a device is not, whose reading may never end
@@ -112,11 +116,10 @@ class _Loader(yaml.SafeLoader):
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         found: dict[Hashable, Any] = {}
         for key, value in node.value:
-            name = self.construct_object(key, deep=True) if isinstance(key, yaml.ScalarNode) else None
-            name = str(name) if isinstance(name, int) and not isinstance(name, bool) else name
             where = f"line {key.start_mark.line + 1} names"
-            if not isinstance(name, str):
-                raise UserValueError(f"{where} a value by {shown(name)}, and a name must be a word.")
+            if not isinstance(key, yaml.ScalarNode) or not key.value:
+                raise UserValueError(f"{where} a value by {key.tag.rsplit(':')[-1]}, and a name must be a word.")
+            name = key.value  # as it stands there: on and 1, too
             if name in found:
                 raise UserValueError(f"{where} {shown(name)} for the second time. Leave one of them out.")
             found[name] = self.construct_object(value, deep=True)

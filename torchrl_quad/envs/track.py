@@ -83,7 +83,7 @@ class Gate:
         if {name for name in _OPENING if getattr(self, name) is not None} not in ({"width", "height"}, {"radius"}):
             raise UserValueError(
                 "how far it is open is not said. Give width and height, or radius [m], once for the track or for each "
-                "gate: load_track(..., width=1.5, height=1.5)."
+                "gate: load_track(..., width=1.5, height=1.5), or env.track={file: ..., width: 1.5, height: 1.5}."
             )
 
     def entries(self) -> dict[str, Any]:

@@ -77,7 +77,7 @@ def agile_flight(source: str, values: dict[str, Any], gates: list[Mapping[str, A
         if len(fit) != 1:
             raise UserValueError(
                 f"{source}: its gates are flown along one of their axes, and their order does not show which. Give "
-                f'axis="x", "-x", "y" or "-y".'
+                f'axis="x", "-x", "y" or "-y". Rotations are read as w, x, y, z.'
             )
         (axis,) = fit
     elif axis not in AXES:
@@ -117,8 +117,14 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
     """Of utiasDSL/lsy_drone_racing: square gates, flown along their x axis, poles, and how both are drawn."""
     track = values["env"]["track"]
     centres = as_array([gate["pos"] for gate in track["gates"]])
-    start, limits = as_array(track["drones"][0]["pos"]).tolist(), track["safety_limits"]
-    box = as_array([limits["pos_limit_low"], limits["pos_limit_high"]]).tolist()
+    drones = track["drones"] if "drones" in track else [track["drone"]]  # in the first versions
+    start, limits = as_array(drones[0]["pos"]).tolist(), track.get("safety_limits")
+    if limits is None and "box" not in values:
+        raise UserValueError(
+            f"{source}: does not say safety_limits. Give box=[[x, y, z], [x, y, z]], the least and the greatest [m]."
+        )
+    box = values.get("box") or [limits["pos_limit_low"], limits["pos_limit_high"]]
+    box = as_array(box).tolist()
     own = {key: x for key, x in values.items() if key not in ("controller", "deploy", "sim", "env")}
     own = {"width": LSY_OPENING, "height": LSY_OPENING, "frame": LSY_FRAME, "closed": False, "box": box, **own}
     notes = [
@@ -126,6 +132,15 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
         "the drone hovers above its start; drone, sensors and disturbances are not read",
     ]
     own |= {"start_range": 0.05, "floor": box[0][2], "notes": notes}
+    if len(drones) > 1:
+        notes.append(f"{len(drones)} drones race there: the first is read")
+    order = [int(x) for x in track.get("gate_order", range(1, len(centres) + 1))]
+    gates = [abs(x) - 1 for x in order]
+    if not gates or not 0 <= min(gates) <= max(gates) < len(centres):
+        raise UserValueError(f"{source}: gate_order names gates from 1 to {len(centres)}; got {shown(order)}.")
+    centres, rotations = centres[gates], from_euler(as_array([gate["rpy"] for gate in track["gates"]]))[gates]
+    back = from_euler(np.array([0.0, 0.0, math.pi]))  # a negative number is a gate that is flown backwards
+    rotations = np.where(np.array(order)[:, None] < 0, multiply(rotations, back), rotations)
     if track.get("randomize", False) or "random" in values:  # of positions it says nothing but the limits
         low, high = box
         reach = min(high[i] - low[i] for i in (0, 1)) / 2.0
@@ -133,9 +148,15 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
         own["random"] = {**rules, "turn": 2.2, "yaw": 0.75, **(values.get("random") or {})}
         notes.append("gates stand anew in each episode, by the rules of random tracks; no poles")
         return own
-    drawn = {name: _spread(source, x) for name, x in values["env"].get("randomizations", {}).items()}
+    spreads = values["env"].get("randomizations") or values["env"].get("randomization") or {}
+    drawn = {name: _spread(source, x) for name, x in spreads.items()}
+    if len(set(gates)) < len(gates) and {"gate_pos", "gate_rpy"} & drawn.keys():
+        raise UserValueError(
+            f"{source}: its gate_order passes a gate twice, and gates are moved at random, each passage by itself. "
+            "Take the randomizations out."
+        )
     middle, spread = drawn.get("gate_pos", (np.zeros(3), None))
-    centres, rotations = centres + middle, from_euler(as_array([gate["rpy"] for gate in track["gates"]]))
+    centres = centres + middle
     own["gates"] = posed(centres, rotations)
     before = (centres - LSY_RUN_UP * rotate(rotations, [1.0, 0.0, 0.0])).tolist()
     own |= {"position_jitter": spread.tolist()} if spread is not None else {}
@@ -175,7 +196,9 @@ def _in_order(gates: Mapping[str, Mapping]) -> list[Mapping[str, Any]]:
 
 def _spread(source: str, spec: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     """The middle of what is drawn uniformly, and how far it goes to both sides."""
-    if spec["fn"] != "uniform":
-        raise UserValueError(f"{source}: what is drawn must be uniform; got {shown(spec['fn'])}.")
-    low, high = (as_array(spec["kwargs"][key]) for key in ("minval", "maxval"))
+    law = spec["fn"] if "fn" in spec else spec["type"]  # in the first versions
+    if law != "uniform":
+        raise UserValueError(f"{source}: what is drawn must be uniform; got {shown(law)}.")
+    ends = (spec["kwargs"]["minval"], spec["kwargs"]["maxval"]) if "kwargs" in spec else (spec["low"], spec["high"])
+    low, high = (as_array(x) + np.zeros(3) for x in ends)
     return 0.5 * (low + high), 0.5 * (high - low)

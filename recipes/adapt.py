@@ -10,8 +10,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_quad.adaptation import Adapter, write_report
 from torchrl_quad.deploy import export_policy, frames
+from torchrl_quad.deploy.contract import sha256
 from torchrl_quad.dynamics import MotorCommand
-from torchrl_quad.files import make_folder
+from torchrl_quad.files import replacing_folder
 from torchrl_quad.identification import read_log
 from torchrl_quad.training.building import build_env
 from torchrl_quad.training.checkpoints import read_checkpoint, write_checkpoint
@@ -28,19 +29,31 @@ def main(cfg: DictConfig) -> None:
     columns = OmegaConf.to_container(cfg)["columns"]
     logs = [read_log(path, columns, convention=convention) for path in cfg.logs]
     motors = None if cfg.motor_command is None else MotorCommand(**cfg.motor_command)
-    env = build_env(trained, cfg.num_envs, cfg.seed, compile=cfg.compile, normalizer=normalizer)
-    adapter = Adapter(actor, env, motors, **{name: cfg[name] for name in ("max_kl", "steps", "num_envs", "seed")})
-    print(f"Compiled in {adapter.warm_up():.0f} s.")
-    found = adapter(logs)
-    print(found.reason)
-    folder = make_folder(cfg.folder or checkpoint.parent / "adapted")
-    write_report(found, folder / "report.html", logs)
-    if found.changed:
-        saved = read_checkpoint(checkpoint)
-        saved["best"] |= {"actor": found.policy.state_dict()}
-        write_checkpoint(folder / "checkpoint.pt", saved)
-        export_policy(found.policy, env, folder / "policy", origin={"adapted_from": ", ".join(x.name for x in logs)})
-    print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
+    with replacing_folder(Path(cfg.folder or checkpoint.parent / "adapted"), report_only) as folder:
+        env = build_env(trained, cfg.num_envs, cfg.seed, compile=cfg.compile, normalizer=normalizer)
+        adapter = Adapter(actor, env, motors, **{name: cfg[name] for name in ("max_kl", "steps", "num_envs", "seed")})
+        print(f"Compiled in {adapter.warm_up():.0f} s.")
+        found = adapter(logs)
+        print("\n".join([*(f"{log.name}: {note}" for log in logs for note in log.notes), found.reason]))
+        write_report(found, folder / "report.html", logs)
+        if found.fit is not None and found.changed:
+            saved = read_checkpoint(checkpoint)
+            saved["best"] |= {"actor": found.policy.state_dict(), "return": found.after["return"]}
+            write_checkpoint(folder / "checkpoint.pt", saved | {"stateful": [], "processes": []})  # no run to continue
+            adapter.task.set_params(found.fit.drone())
+            origin = {
+                "adapted_from": ", ".join(x.name for x in logs),
+                "checkpoint_sha256": sha256(checkpoint.read_bytes()),
+            }
+            export_policy(found.policy, adapter.env, folder / "policy", origin=origin | {"revision": saved["revision"]})
+        written = ", ".join(sorted(path.name for path in folder.iterdir()))
+    print(f"{cfg.folder or checkpoint.parent / 'adapted'}: {written}")
+
+
+def report_only(folder: Path) -> None:
+    """Raise FileExistsError for a folder that holds more than a report: nothing else is replaced."""
+    if found := sorted(x.name for x in folder.iterdir() if x.name != "report.html") if folder.is_dir() else []:
+        raise FileExistsError(f"{folder} holds {', '.join(found[:5])} already. Choose another folder=.")
 
 
 if __name__ == "__main__":

@@ -86,11 +86,21 @@ def short(log):
     return dataclasses.replace(log, segments=((0, 60),))
 
 
+def thrown(log):
+    """With accelerations that no rotor made."""
+    shaken = log.velocity + 2.0 * np.sin(9.0 * log.time)[:, None]
+    return dataclasses.replace(log, velocity=shaken)
+
+
 @cases(
     (silent, "does not tell what each rotor gives"),
     (short, "no piece of the flight is"),
-    (lambda log: flown([1.0] * 4, (0.0, 0.0, 0.0), 2.0), "of what was held out"),
-    ids=["silent", "short", "as expected"],
+    (lambda log: flown([1.0] * 4, (0.0, 0.0, 0.0), 2.0), "predicts what was held out no better than"),
+    (lambda log: dataclasses.replace(log, motor_command=0.7 * log.motor_command), "all rotors together would give 1."),
+    (lambda log: [log, flown([1.0] * 4, WIND, 2.0)], "does not agree with the others"),
+    (lambda log: [log, flown(GIVES, (-4.0, 2.0, 0.0), 4.0)], "does not agree with the others"),
+    (thrown, "the fit still misses the acceleration by"),
+    ids=["silent", "short", "as expected", "other commands", "two drones", "two winds", "thrown"],
 )
 def test_a_flight_that_tells_nothing_changes_nothing_and_says_why(change, why, log, hovering):
     actor = make_actor(hovering)
@@ -103,6 +113,11 @@ def test_a_policy_that_no_step_improves_stays(log, hovering, monkeypatch):
     monkeypatch.setattr("torchrl_quad.adaptation.adapting._score", lambda flight: 1.0)
     found = adapt(make_actor(hovering), hovering, log, motors=MOTORS, **BRIEF)
     assert not found.changed and "no step made the policy better" in found.reason
+    monkeypatch.undo()
+    rising = iter([{"return": 1.0, "crash": 1.0}, {"return": 2.0, "crash": 1.0}])
+    monkeypatch.setattr(Adapter, "_measure", lambda self, flight: next(rising))
+    found = adapt(make_actor(hovering), hovering, [log, log], motors=MOTORS, **BRIEF)  # which agree
+    assert not found.changed and "where it crashes in 100% of the episodes" in found.reason
 
 
 def test_what_cannot_be_adapted_is_refused_by_name(hovering):
@@ -111,6 +126,7 @@ def test_what_cannot_be_adapted_is_refused_by_name(hovering):
     any_drone = HoveringEnv(num_envs=2, randomize="any", control="rotor_thrusts")
     refuses("for any drone", Adapter, actor, any_drone, MOTORS)
     refuses("no motor_command", Adapter, actor, hovering)
+    refuses("motors must be a MotorCommand, not str", Adapter, actor, hovering, "fast", error=TypeError)
     refuses("GeometricController is no policy", Adapter, GeometricController(hovering), hovering, error=TypeError)
     refuses("must be a QuadrotorEnv", Adapter, actor, None, MOTORS, error=TypeError)
     seeing = HoveringEnv(num_envs=2, camera={"width": 4, "height": 3})
@@ -118,7 +134,7 @@ def test_what_cannot_be_adapted_is_refused_by_name(hovering):
 
 
 def test_the_recipe_writes_a_policy_a_bundle_and_a_page_and_leaves_the_checkpoint_alone(
-    log, launch, no_pictures, tmp_path, trace_once
+    log, launch, refused, no_pictures, tmp_path, trace_once
 ):
     trace_once("hovering")
     launch("bptt", *SMALL, f"hydra.run.dir={tmp_path}", "task=hovering", "env.max_episode_steps=48")
@@ -128,15 +144,21 @@ def test_the_recipe_writes_a_policy_a_bundle_and_a_page_and_leaves_the_checkpoin
     csv, old = write_csv(tmp_path / "swing.csv", columns), checkpoint.read_bytes()
     named = ", ".join(f"{q}: [{', '.join(OURS[q])}]" for q in OURS if q != "acceleration")
     settings = ["steps=3", "num_envs=4", "compile=false", "motor_command={speed_per_volt: 3500, nominal_voltage: 1}"]
-    launch("adapt", f"checkpoint={checkpoint}", f"logs=[{csv}]", f"columns={{time: t, {named}}}", *settings)
-    folder = tmp_path / "adapted"
+    arguments = f"checkpoint={checkpoint}", f"logs=[{csv}]", f"columns={{time: t, {named}}}", *settings
+    folder, said = tmp_path / "adapted", launch("adapt", *arguments)
+    assert "swing: " in said and "the return in the fitted simulator rose" in said
+    assert "adapted holds checkpoint.pt, policy already. Choose another folder" in refused("adapt", *arguments)
+    assert " config.yaml" in refused("adapt", *arguments, f"folder={tmp_path}")
     assert {x.name for x in folder.iterdir()} == {"checkpoint.pt", "policy", "report.html"}
     assert checkpoint.read_bytes() == old
     new = read_checkpoint(folder / "checkpoint.pt")["best"]["actor"]
     assert any((x != new[name]).any() for name, x in read_checkpoint(checkpoint)["best"]["actor"].items())
     page = (folder / "report.html").read_text()
     assert "What is not covered" in page and page.count("data:image/png") == 2 and "http" not in page
-    flight, world = benchmark.fly(load_bundle(folder / "policy"), 3, 0, 1)  # the bundle meets what the benchmark does
+    bundle = load_bundle(folder / "policy")
+    np.testing.assert_allclose(bundle.contract["plant"]["rotor_effectiveness"], GIVES, atol=0.05)
+    assert "an adapted policy, and no run to continue" in refused("bptt", f"resume={folder}/checkpoint.pt")
+    flight, world = benchmark.fly(bundle, 3, 0, 1)  # the bundle meets what the benchmark does
     steps = int(flight["done"][0].argmax()) + 1
     assert len(world.samples) == 20 * steps == benchmark.LOGGED * len(world.log(0).time)
 

@@ -82,7 +82,8 @@ AGILICIOUS = {"mass": 0.75, "tbm_fr": [0.2, -0.1, 0], "tbm_bl": [-0.2, 0.1, 0], 
 AGILICIOUS |= {"tbm_fl": [0.2, 0.1, 0], "inertia": [0.0025, 0.0021, 0.0043], "motor_omega_min": 150, "motor_tau": 0.033}
 AGILICIOUS |= {"motor_omega_max": 2000, "kappa": 0.022, "thrust_max": 8, "aero_coeff_1": [0.1, 0.1, 0.2]}
 AGILICIOUS |= {"omega_max": [10, 10, 4]}
-FLIGHTMARE = "rgb_camera: {on: yes}\nquadrotor_dynamics: {mass: 0.73, arm_l: 0.17, thrust_map: [1.3e-6, 0, 0], kappa: 0.016, motor_tau: 0.03}"
+FLIGHTMARE = "rgb_camera: {on: yes}\n"
+FLIGHTMARE += "quadrotor_dynamics: {mass: 0.73, arm_l: 0.17, thrust_map: [1.3e-6, 0, 0], kappa: 0.016, motor_tau: 0.03}"
 TILTING = "<joint name='k' type='fixed'><parent>arm</parent><child>x::rotor_0</child></joint>"
 TILTING += "<joint name='tilt' type='revolute'><parent>base_link</parent><child>arm</child></joint>"
 HOVER, FAST = np.sqrt(9.81 * 2 / 4 / 1e-5), 2 * np.pi / 60  # of a rotor of the SDF [rad/s]; of one rpm

@@ -18,7 +18,7 @@ from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs import QuadrotorEnv
 from torchrl_quad.envs.disturbances import Disturbance
 from torchrl_quad.envs.randomness import Randomness
-from torchrl_quad.identification import FlightLog, prediction
+from torchrl_quad.identification import FlightLog, NotOneDrone, prediction
 from torchrl_quad.identification.estimation import held_out
 
 #: The unknowns of a fit in the order of its coordinates: how many, how far they may lie from zero (one standard
@@ -35,6 +35,9 @@ _GROUPS = {"rotors": range(4), "turning.x": [4], "turning.y": [5], "turning.z": 
 WINDOW = 0.1  # [s], over which accelerations are averaged
 _CORRELATED = 4.0  # windows in a row that err alike
 _LEAST = torch.tensor([0.02] * 3 + [0.1] * 3, dtype=torch.float64)  # error of a window: [m/s2] and [rad/s2]
+APART = 2.0  # ratio of squared errors of a flight, fitted with others and alone, that tells another drone or wind
+COMMON = (0.6, 1.2)  # of the thrust, which a payload or tired motors may change; all else is another drone or command
+LARGEST = 3.0  # [m/s2], error of a fit in the acceleration of a flight
 _STEPS = 6  # of Gauss and Newton; the wind's drag is quadratic, all else nearly linear
 
 
@@ -64,6 +67,11 @@ class FlightFit:
         """The wind at the mean height, its growth with height, and these heights: (*, 6), as ``wind_at`` reads them."""
         _, _, wind, shear = x.split(_SIZES, -1)
         return torch.cat((wind, shear, x.new_tensor(self.height).expand(*x.shape[:-1], 2)), -1)
+
+    def drone(self) -> QuadrotorParams:
+        """The drone as the flights show it."""
+        changes = {name: x.tolist() for name, x in self.fields(self.mean).items()}
+        return self.prior.replace(**changes)
 
     def spread(self) -> Tensor:
         """The standard deviation of each unknown (11)."""
@@ -115,6 +123,7 @@ def fit_flight(logs: Sequence[FlightLog], drone: QuadrotorParams, motors: MotorC
 
     Raises:
         TooShort: no piece of a flight is long enough for a window.
+        NotOneDrone: the flights are not of one drone in one air, or not of this drone by these motor commands.
     """
     prior = prediction.as_params(drone)
     windows = prediction.cut(logs, 0.02, WINDOW, WINDOW, nominal_voltage=motors.nominal_voltage)
@@ -139,13 +148,36 @@ def fit_flight(logs: Sequence[FlightLog], drone: QuadrotorParams, motors: MotorC
             break
         open_ = {name: group for name, group in open_.items() if name not in wide}
     kept = [errors(nothing)[held], errors(x)[held]]
-    # Errors below those of a good fit say nothing.
-    squares = [(e / scale).square().clamp_max(100.0).mean().clamp_min(1.0) for e in kept]
+
+    def misses(e: Tensor, scale: Tensor) -> float:  # errors below those of a good fit say nothing
+        return float((e / scale).square().clamp_max(100.0).mean().clamp_min(1.0))
+
+    for k, log in enumerate(logs if len(logs) > 1 and free else ()):
+        own = windows.log == k
+        alone, _, usual = _solve(errors, free, ~held & own)
+        ratio = misses(errors(x)[held & own], usual) / misses(errors(alone)[held & own], usual)
+        if ratio > APART:
+            raise NotOneDrone(
+                f"{log.name} does not agree with the others: by itself it is predicted {ratio:.2g} times as well. Give "
+                "flights of one drone in one wind, or each by itself."
+            )
+    squares = [misses(e, scale) for e in kept]
     rms = [
         {"acceleration": float(e[:, :3].square().sum(1).mean().sqrt()),
          "angular_acceleration": float(e[:, 3:].square().sum(1).mean().sqrt())}
         for e in kept
     ]  # fmt: skip
+    common = 1.0 + float(x[:4].mean())
+    if "rotors" in open_ and not COMMON[0] < common < COMMON[1]:
+        raise NotOneDrone(
+            f"all rotors together would give {common:.2f} of the thrust of the simulator's drone. Check its mass and "
+            "thrust map, and what a motor command means (motor_command, the battery): no fit tells these apart."
+        )
+    if "rotors" in open_ and rms[1]["acceleration"] > LARGEST:
+        raise NotOneDrone(
+            f"the fit still misses the acceleration by {rms[1]['acceleration']:.2g} m/s2. Check the drone, the units "
+            "of the log, and what a motor command means (motor_command)."
+        )
     values, vectors = torch.linalg.eigh(cover)
     return dataclasses.replace(
         fit,
@@ -154,7 +186,7 @@ def fit_flight(logs: Sequence[FlightLog], drone: QuadrotorParams, motors: MotorC
         not_told={name: UNKNOWNS[name.partition(".")[0]][2] for name in _GROUPS if name not in open_},
         before=rms[0],
         after=rms[1],
-        gain=float(1.0 - squares[1] / squares[0]),
+        gain=1.0 - squares[1] / squares[0],
     )
 
 

@@ -29,18 +29,26 @@ def write_report(found: Adaptation, path: str | Path, logs: Sequence[FlightLog])
         path: of the page.
         logs: the flights that it was given.
     """
-    flown = "".join(f"<li>{html.escape(x.name)}: {_ranges(x)}</li>" for x in logs)
+    flown = "".join(f"<li>{html.escape('. '.join([f'{x.name}: {_ranges(x)}', *x.notes]))}</li>" for x in logs)
     verdict = "The policy changed" if found.changed else "The policy stays as it was"
     parts = [f"<h1>{verdict}</h1><p>{html.escape(found.reason)}.</p>"]
     left = ["Speeds, heights and turns beyond those of the flights below", "Gusts: the wind is taken as steady"]
     if (fit := found.fit) is not None:
         rows = [(f"error of {k.replace('_', ' ')}, held out", v, fit.after[k]) for k, v in fit.before.items()]
-        parts += ["<h2>What the flights say</h2>", _table("of the simulator", "of the fit", rows), _image(_fitted(fit))]
+        parts += ["<h2>What the flights say</h2>", _table("of the simulator", "of the fit", rows)]
+        wide = (1.96 * fit.spread()).tolist()
+        parts += [_table("fitted", "&plusmn; 95 %", [*zip(_NAMES, fit.mean.tolist(), wide, strict=True)])]
+        parts += [
+            "<p>Rotors and turning are relative to the simulator's: 0 is no change. Wind is in m/s, shear in 1/s."
+        ]
+        parts += [_image(_fitted(fit), "The table as a picture")]
+        left += ["A change that all rotors share: mass, battery and motor_command have the same effect"]
+        left += ["The simulator's own drone, which evaluate.py flies: the new policy is for the fitted one"]
         left += [f"{name}, which is the simulator's: it needs {why}" for name, why in fit.not_told.items()]
     if found.flights:
         rows = [(name.replace("_", " "), x, found.after[name]) for name, x in found.before.items()]
         parts += ["<h2>The policies in the fitted simulator</h2>", _table("before", "after", rows)]
-        parts.append(_image(_compared(found)))
+        parts.append(_image(_compared(found), "Both policies over time: the median, and nine in ten flights"))
     parts.append(f"<h2>What is not covered</h2><ul>{''.join(f'<li>{x}.</li>' for x in left)}</ul>")
     spent = ", ".join(f"{name} {x:.1f} s" for name, x in found.seconds.items())
     parts.append(f"<h2>Flights</h2><ul>{flown}</ul><p>KL divergence from the old policy: {found.kl:.3g}. {spent}.</p>")
@@ -61,10 +69,11 @@ def _table(before: str, after: str, rows: Sequence[tuple[str, float, float]]) ->
     return f"<table><tr><th></th><th>{before}</th><th>{after}</th></tr>{lines}</table>"
 
 
-def _image(figure: Any) -> str:
+def _image(figure: Any, caption: str) -> str:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
-    return f'<p><img alt="" src="data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}">'
+    picture = base64.b64encode(buffer.getvalue()).decode()
+    return f'<p><img alt="{caption}" src="data:image/png;base64,{picture}"><br>{caption}.'
 
 
 def _fitted(fit: FlightFit) -> Any:

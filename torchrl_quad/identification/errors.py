@@ -64,3 +64,7 @@ class NoFlight(LogError):
 
 class TooShort(LogError):
     """No piece of the flight is long enough to predict anything, or all are too short for so many unknowns."""
+
+
+class NotOneDrone(LogError):
+    """Flights are not of one drone in one air, or not of the drone that they are said to be of."""

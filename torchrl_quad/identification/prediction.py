@@ -341,7 +341,7 @@ def cut(
             needed = past + future + WARM_UP + 2 * MAX_DELAY
             raise TooShort(
                 f"{log.name}: no piece of the flight is {needed:.2f} s long, which a prediction of {future:g} s needs: "
-                f"with {past + WARM_UP:g} s before it, and room for delays. Give a longer flight, or shorter horizons."
+                f"with {past + WARM_UP:g} s before it, and room for delays. Give a longer flight, or leave it out."
             )
     length = max(len(c) for c in columns)
     stacked = torch.from_numpy(np.stack([np.pad(c, ((0, length - len(c)), (0, 0)), "edge") for c in columns]))

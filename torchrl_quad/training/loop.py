@@ -377,6 +377,8 @@ class Run:
     def _load(self, path: Path) -> dict[str, Any] | None:
         """Take everything from a checkpoint, and return the state of the logger."""
         saved = read_checkpoint(path)
+        if not saved["processes"]:
+            raise UserValueError(f"{path} holds an adapted policy, and no run to continue. Adapt it again, or train.")
         if len(saved["processes"]) != world_size():
             raise UserValueError(
                 f"{path} was written by {len(saved['processes'])} processes, and {world_size()} want to continue. "

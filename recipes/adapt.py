@@ -6,15 +6,14 @@ python recipes/adapt.py checkpoint=outputs/.../checkpoint.pt 'logs=[flight1.csv]
 from pathlib import Path
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from torchrl_quad.adaptation import Adapter, write_report
-from torchrl_quad.deploy import export_policy, frames
+from torchrl_quad.deploy import export_policy
 from torchrl_quad.deploy.contract import sha256
 from torchrl_quad.dynamics import MotorCommand
 from torchrl_quad.files import replacing_folder
-from torchrl_quad.identification import read_log
-from torchrl_quad.training.building import build_env
+from torchrl_quad.training.building import build_env, read_logs
 from torchrl_quad.training.checkpoints import read_checkpoint, write_checkpoint
 from torchrl_quad.training.evaluation import load_policy
 from torchrl_quad.training.launch import recipe
@@ -25,9 +24,7 @@ def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     checkpoint = Path(cfg.checkpoint)
     trained, actor, normalizer = load_policy(checkpoint, trust=cfg.trust)
-    convention = None if cfg.convention is None else getattr(frames, cfg.convention)()
-    columns = OmegaConf.to_container(cfg)["columns"]
-    logs = [read_log(path, columns, convention=convention) for path in cfg.logs]
+    logs = read_logs(cfg)
     motors = None if cfg.motor_command is None else MotorCommand(**cfg.motor_command)
     with replacing_folder(Path(cfg.folder or checkpoint.parent / "adapted"), report_only) as folder:
         env = build_env(trained, cfg.num_envs, cfg.seed, compile=cfg.compile, normalizer=normalizer)

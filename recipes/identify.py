@@ -6,9 +6,9 @@ python recipes/identify.py 'logs=[flight1.csv, flight2.csv]' drone=crazyflie mas
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_quad.deploy import frames
 from torchrl_quad.files import make_folder
-from torchrl_quad.identification import Columns, identify, read_log
+from torchrl_quad.identification import identify
+from torchrl_quad.training.building import read_logs
 from torchrl_quad.training.launch import recipe
 
 
@@ -16,11 +16,7 @@ from torchrl_quad.training.launch import recipe
 def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     settings = OmegaConf.to_container(cfg)
-    convention = None if cfg.convention is None else getattr(frames, cfg.convention)()
-    columns = settings["columns"]
-    if isinstance(columns, dict):  # a mapping for Columns: {names: [ax, ay, az], scale: 9.80665}
-        columns = {name: Columns(**x) if isinstance(x, dict) else x for name, x in columns.items()}
-    logs = [read_log(path, columns, convention=convention, **(settings["reading"] or {})) for path in cfg.logs]
+    logs = read_logs(cfg)
     for log in logs:
         print(log)
     known = dict(settings["known"] or {}) | ({} if cfg.mass is None else {"mass": cfg.mass})

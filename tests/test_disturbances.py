@@ -213,7 +213,7 @@ def test_gradients_through_any_drone_agree_with_finite_differences():
     ),
     ({"randomize": {"any": {"delay": [0, 2.5]}}}, "delay needs two whole numbers"),
     ({"randomize": {"any": {}, "mass": {"scale": [1, 2]}}}, "any draws the whole drone, and takes ranges, such as"),
-    ({"randomize": {"any": {"delay": [0, 0]}}, "observe_last_action": True}, "with action_delay=0 there are none"),
+    ({"randomize": {"any": {"delay": [0, 0]}}, "observe_last_action": True}, "without a delay there are none"),
 )
 def test_a_distribution_of_any_drone_that_cannot_be_is_refused(options, message):
     refuses(message, any_drone, 1, **options)

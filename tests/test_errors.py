@@ -58,7 +58,7 @@ def test_an_unknown_option_is_refused_with_the_closest_one_and_all_of_them():
     ({"drone": None}, "drone must be the name of a preset, .* or QuadrotorParams, got None"),
     ({"dtype": torch.int32}, "dtype must be torch.float32 or torch.float64"),
     ({"dynamics": "plane"}, r"dynamics must be one of quadrotor, point_mass(, \w+)*, got 'plane'"),
-    ({"action_delay": 0, "observe_last_action": True}, "with action_delay=0 there are none"),
+    ({"action_delay": 0, "observe_last_action": True}, "without a delay there are none"),
     ({"wind": {"speed": 3}}, "wind: unknown key 'speed'. Allowed: mean, spread, gust, gust_time"),
     ({"wind": {"mean": [1.0]}}, "wind: mean must have at least 3 items, not 1, got .* Along x, y and z"),
     ({"wind": {"spread": [-1.0, 0.0, 0.0]}}, r"wind: spread\[0\] must be at least 0, got -1"),

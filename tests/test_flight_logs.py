@@ -278,7 +278,7 @@ def test_repeated_times_a_missing_battery_and_an_impact_are_told(table, read):
 
 
 def test_a_mapping_replaces_entries_of_a_preset_and_nothing_else(table, plain, read):
-    renamed = read({"Timestamp": 1e3 * table["t"]}, drop=["t"], columns={"time": Columns(("Timestamp",), scale=1e-3)})
+    renamed = read({"T": 1e3 * table["t"]}, drop=["t"], columns={"time": {"names": "T", "scale": 1e-3}})
     np.testing.assert_allclose(renamed.position, plain.position)
     renamed = {"volts": table["pwr_pm_vbat"], "motor_motor_m5": table["t"]}
     log = read(renamed, drop=("pwr_pm_vbat", "sp_ctrltarget_yaw"), columns={"battery_voltage": "volts"})

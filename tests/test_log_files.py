@@ -6,6 +6,7 @@ import os
 import random
 import shutil
 import socket
+import sqlite3
 import struct
 from pathlib import Path
 
@@ -251,6 +252,10 @@ def test_bags_of_ros_1_and_2_find_topics_by_their_types(tmp_path, monkeypatch):
     same(dataclasses.replace(log, motor_command=5.0 * log.motor_command, battery_voltage=volts))
     six = write_bag(tmp_path / "six.bag", ros2=False, speeds=(800,) * 6, share=0.1)
     refuses("/drone/motors drives 6 motors", read_log, six, BATTERY, error=WrongMotors)
+    humble = write_bag(tmp_path / "humble", ros2=True, storage="SQLITE3", share=0.1)
+    with sqlite3.connect(humble / "humble.db3") as bag:
+        bag.execute("delete from message_definitions")
+    assert "does not define its messages mav_msgs/msg/Actuators" in refused(humble, BATTERY)
 
 
 KINDS = dict.fromkeys(("a.ulg", "a.bin", "v1", "v2")) | {"a.csv": TABLE, "a.csv.gz": TABLE}
@@ -338,10 +343,13 @@ REFUSED = {  # what is no log, or what no reader should follow to its end: a fil
     "empty.csv": (b"", "is empty"),
     "zeros.bin": (b"\xa3\x95" + bytes(1000), "not a readable dataflash log"),
     "flight.bbl": (b"H Product:Blackbox flight data recorder by Nicholas Sherlock\n", "neither position nor attitude"),
-    "decoded.csv": (
-        b"loopIteration, time (us), gyroADC[0], motor[0]\n0, 0, 1, 2\n1, 1, 2, 3\n",
-        "a Betaflight blackbox",
-    ),
+    "decoded.csv": (b"time (us), gyroADC[0], motor[0]\n0, 1, 2\n1, 2, 3\n", "a Betaflight blackbox"),
+    "explorer.csv": (b'"Product","Blackbox flight data recorder by Nicholas Sherlock"\n', "a Betaflight blackbox"),
+    "lfs.ulg": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "not downloaded. Write: git lfs pull"),
+    "page.csv": (b"\n<!DOCTYPE html>\n<html>", "is a web page. Download the file itself"),
+    "1.log": (b"FMT, 128, 89, FMT, BBnNZ, Type,Length\n", "the text of a dataflash log. Give its .bin"),
+    "metadata.yaml": (b"rosbag2_bagfile_information:\n  version: 5\n", "Give the folder that it lies in"),
+    "inav.csv": (b"time,gyroADC[0],motor[0],navPos[0]\n0,0,1,2\n1,1,2,3\n", "No preset knows the columns"),
     "junk.bin": (bytes(range(128, 256)), "not a log of a known kind"),
     "text.csv": (b"Dear reader,\nthis is a letter.\n", "fewer than two samples"),
     "ragged.csv": (b"t,x\n1,2\n1,2,3\n", "not a table of numbers"),
@@ -391,7 +399,7 @@ def test_tables_of_other_separators_and_headers_that_begin_as_comments_are_read(
         "\n".join(["#" + head.replace(",", "\t"), *(x.replace(",", "\t") for x in rows)]),
         "\n".join(["% " + head.replace(",", " "), *(x.replace(",", "  ") for x in rows)]),  # as numpy.savetxt writes
         "\n".join([head.replace(",", ";"), *(x.replace(",", ";").replace(".", ",") for x in rows)]),
-        "\n".join(["# a remark", head, *rows]),
+        "\n".join(["# a remark", "%mode," + head, *(f"MANUAL,{x}" for x in rows)]),  # as rostopic writes
     ):
         path.write_text(text)
         np.testing.assert_array_equal(read_log(path, TABLE).position, plain.position)
@@ -410,7 +418,7 @@ def test_a_pipe_a_socket_and_a_device_are_refused_unopened(tmp_path, monkeypatch
         assert "is not a regular file but a pipe, a socket or a device" in refused(path)
     monitor.close()
     (folder / "a.mcap").unlink()
-    assert "bag is not a readable ROS bag" in refused(folder) and "does not exist" in refused(tmp_path / "nowhere.csv")
+    assert "is a folder without a ROS bag" in refused(folder) and "does not exist" in refused(tmp_path / "nowhere.csv")
     monkeypatch.setattr(Path, "is_file", lambda path: True)  # when it was looked at, before it became a pipe
     assert "is not a regular file" in refused(tmp_path / "pipe.csv")
 
@@ -432,8 +440,7 @@ def test_a_clock_that_jumps_ahead_is_refused_before_it_is_put_on_a_grid(tmp_path
 
 def test_values_beyond_any_flight_count_as_missing_and_wide_tables_are_read(tmp_path):
     t = times(100)
-    columns = own_table(t)
-    columns["x"] = np.where(np.arange(len(t)) == 500, 1e38, columns["x"])
+    columns = own_table(t) | {"x": np.where(np.arange(len(t)) == 500, 1e38, own_table(t)["x"])}
     path = write_csv(tmp_path / "a.csv", columns)
     log = read_log(path, TABLE)
     assert np.abs(log.position).max() < 10.0 and "beyond 1e+09" in str(log)

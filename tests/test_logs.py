@@ -200,6 +200,11 @@ def test_a_sweep_hands_over_mappings_and_null_as_people_write_them(train, tmp_pa
     ('env.wind={"mean": [1, 0.5, -1e-05], "gust": null}', "env.wind={mean: [1, 0.5, -1e-05], gust: null}"),
     ("+a={'b c': \"it's\", 'd': True}", r"""+a={b\ c: "it's", d: True}"""),
     ("a=None,{'b': [1, 2]}", "a=null,{b: [1, 2]}"),  # a sweep of hydra's
+    (
+        """columns={"time": Columns(('t(s)',), scale=0.001), 'x': None}""",
+        "columns={time: {names: ['t(s)'], scale: 0.001}, x: null}",
+    ),
+    ("convention=dataclasses.replace(frames.px4(), xyzw=True)", "convention={name: 'px4', xyzw: True}"),
     ("--actor.num_cells=[32, 32]", "actor.num_cells=[32, 32]"),
     ("env.wind={mean: [1, 0, 0]}", "env.wind={mean: [1, 0, 0]}"),
     *((x, x) for x in ("env.drone=None_of_them", "--config-name=abpt", "--cfg=job", "--multirun", "~env.wind")),

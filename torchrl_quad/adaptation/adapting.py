@@ -185,6 +185,8 @@ class Adapter:
             return self._kept(why, fit, clock, before, flights)
         self.policy = new
         reason = f"the return in the fitted simulator rose from {before['return']:.4g} to {after['return']:.4g}"
+        if abs(fit.thrust - 1.0) > 0.1:
+            reason += f"; all rotors give {fit.thrust:.2f} of the thrust, by a load or a wrong motor_command"
         return self._found(True, reason, fit, clock, before, after, kl, flights)
 
     def _improve(self, old: Any) -> Any:

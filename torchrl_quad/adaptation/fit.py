@@ -68,6 +68,11 @@ class FlightFit:
         _, _, wind, shear = x.split(_SIZES, -1)
         return torch.cat((wind, shear, x.new_tensor(self.height).expand(*x.shape[:-1], 2)), -1)
 
+    @property
+    def thrust(self) -> float:
+        """Of all rotors together, relative to the simulator's drone."""
+        return 1.0 + float(self.mean[:4].mean())
+
     def drone(self) -> QuadrotorParams:
         """The drone as the flights show it."""
         changes = {name: x.tolist() for name, x in self.fields(self.mean).items()}
@@ -167,7 +172,7 @@ def fit_flight(logs: Sequence[FlightLog], drone: QuadrotorParams, motors: MotorC
          "angular_acceleration": float(e[:, 3:].square().sum(1).mean().sqrt())}
         for e in kept
     ]  # fmt: skip
-    common = 1.0 + float(x[:4].mean())
+    common = dataclasses.replace(fit, mean=x).thrust
     if "rotors" in open_ and not COMMON[0] < common < COMMON[1]:
         raise NotOneDrone(
             f"all rotors together would give {common:.2f} of the thrust of the simulator's drone. Check its mass and "

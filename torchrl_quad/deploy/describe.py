@@ -328,7 +328,9 @@ def write_page(contract: Contract, documentation: str | None) -> bytes:
         for side in ("reads", "writes")
         for name, x in sides[side].items()
     ]
-    camera = contract["camera"]
+    camera, delay, dt = contract["camera"], contract["action_delay"], contract["control_dt"]
+    drawn = contract["randomized"].get("delay", {}).get("any")  # by randomize="any"
+    flown = "drones from the ranges in `randomized`, of which the one in `drone` is the middle"
     lines = inspect.cleandoc(documentation or "There is none.").splitlines()
     values = {
         "task": task["name"],
@@ -350,9 +352,11 @@ def write_page(contract: Contract, documentation: str | None) -> bytes:
         "law": output["law"],
         "weight": f"{output['thrust']['weight']:.6g}",
         "hover": ", ".join(f"{x:.6g}" for x in output["hover_action"]),
-        "control_dt": f"{contract['control_dt']:g}",
-        "delay": contract["action_delay"],
-        "delay_seconds": f"{contract['action_delay'] * contract['control_dt']:g}",
+        "control_dt": f"{dt:g}",
+        "delay": f"{drawn[0]:g} to {drawn[1]:g}" if drawn else delay,
+        "delay_seconds": f"{drawn[0] * dt:g} to {drawn[1] * dt:g}" if drawn else f"{delay * dt:g}",
+        "most": f"{output['range'][0][1]:.6g}",
+        "flown": flown if drawn else "the drone in `drone` and the rate loop in `rate_loop`",
         "age": f"{contract['limits']['max_state_age']:g}",
         "fields": schema_table(),
         "package": contract["origin"]["package"],
@@ -366,6 +370,7 @@ def write_page(contract: Contract, documentation: str | None) -> bytes:
         values["camera_pixel"] = ray if camera["along_ray"] else axis
     features = [name for name in ("camera", "memory") if contract[name]]
     features += ["autopilots"] if autopilots.fit(contract) else []
+    features += ["any"] if drawn else []
     features += ["advance"] if "advance" in graphs else []
     features += [] if task["unjudged"] else ["judged"]
     return fill_in("README.md", values, features).encode()

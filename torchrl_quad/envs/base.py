@@ -152,7 +152,9 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         if isinstance(drawn, AnyDrone):
             self.action_delay = drawn.queue_length(action_delay)
         if self.action_delay == 0 and observe_last_action:
-            raise UserValueError("observe_last_action shows commands on their way; with action_delay=0 there are none.")
+            raise UserValueError(
+                "observe_last_action shows commands on their way, and without a delay there are none. Leave it out."
+            )
         self._params = params if params.requires_grad or params.rotor_effectiveness is not None else self.nominal
         self.randomness.seed(seed)
         self.set_up()

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -95,6 +95,8 @@ class Layout:
 
 
 def _as_columns(quantity: object, names: object) -> Columns:
+    if isinstance(names, Mapping) and "names" in names and set(names) <= {"names", "scale", "offset"}:
+        names = Columns(**cast("dict[str, Any]", dict(names)))
     if not isinstance(names, Columns):
         if not isinstance(names, Sequence) or isinstance(names, bytes):
             raise UserTypeError(
@@ -202,7 +204,7 @@ def match(header: Sequence[str], name: str) -> Layout:
     for layout in LAYOUTS.values():
         if {*layout.time.names, *layout.columns["position"][0].names} <= set(header):
             return layout
-    if {"gyroADC[0]", "motor[0]"} <= set(header):
+    if {"gyroADC[0]", "motor[0]"} <= set(header) and not any(x.startswith("navPos") for x in header):
         raise blackbox(name)
     raise MissingColumns(f"No preset knows the columns of {name}. {_columns_there(header)}")
 

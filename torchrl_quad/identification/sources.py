@@ -9,6 +9,7 @@ import gzip
 import io
 import itertools
 import os
+import re
 import zlib
 from array import array
 from collections.abc import Iterator, Mapping
@@ -30,6 +31,12 @@ Read = tuple[list[Stream], Layout, list[str]]
 MAX_BYTES, MAX_UNPACKED = 2 * 10**9, 500 * 10**6
 MAX_LINE, MAX_ROWS = 4 * 10**6, 5 * 10**6  # bytes and lines of a CSV file
 _CUT = "Cut it into shorter logs."
+_NO_LOG = {  # by what it begins with
+    rb"version https://git-lfs": "stands for a file that was not downloaded. Write: git lfs pull",
+    rb"\s*<(!doctype )?html": "is a web page. Download the file itself, which GitHub calls raw.",
+    rb"FMT, *128": "is the text of a dataflash log. Give its .bin.",
+    rb"rosbag2_bagfile_information": "only describes a ROS bag. Give the folder that it lies in.",
+}
 # By the first bytes.
 _READERS = {b"ULog\x01\x12\x35": (read_ulog, "px4"), b"\xbc": (read_usd, "crazyflie")}
 _READERS[HEAD] = (read_dataflash, "ardupilot")
@@ -39,6 +46,8 @@ def read_streams(path: Path, columns: Asked) -> Read:
     """The streams of a file, what is where in it, and notes. Its first bytes tell the kind of file."""
     if not path.exists():
         raise UnreadableLog(f"{path} does not exist. Give the path of a log.")
+    if path.is_dir() and not any(x.suffix in (".db3", ".mcap", ".bag", ".zstd") for x in path.iterdir()):
+        raise UnreadableLog(f"{path} is a folder without a ROS bag. Give the path of the log in it.")
     if path.is_dir():
         return read_bag(path, columns)
     with open_plain(path) as file:
@@ -58,8 +67,11 @@ def read_streams(path: Path, columns: Asked) -> Read:
 
 def _read(file: io.BufferedReader[Any], name: str, columns: Asked, most: int) -> Read:
     start = file.peek(8192)
-    if start.startswith(b"H Product:Blackbox"):
+    if re.match(rb'H Product:Blackbox|"?Product"?,"?Blackbox', start):
         raise blackbox(name)
+    for beginning, why in _NO_LOG.items():
+        if re.match(beginning, start, re.IGNORECASE):
+            raise UnreadableLog(f"{name} {why}")
     for magic, (reader, preset) in _READERS.items():
         if start.startswith(magic):
             layout = LAYOUTS[preset] if columns is None else choose(columns, LAYOUTS[preset])
@@ -155,7 +167,7 @@ def _preset(header: list[str], name: str, columns: Asked) -> Layout | None:
 
 def _rows(lines: Iterator[bytes], name: str) -> Iterator[str]:
     """The rows of a table as text, without comments and empty ones. The last comment above rows of numbers is the first
-    row, which names their columns."""
+    row, which names their columns; some may hold text."""
     remark, begun = "", False
     for k, line in enumerate(lines):
         if k >= MAX_ROWS:
@@ -175,7 +187,11 @@ def _rows(lines: Iterator[bytes], name: str) -> Iterator[str]:
         text = text.partition("#")[0].strip(" ") if begun and "#" in text else text
         if not begun and text:
             begun, mark = True, _mark(remark)
-            if remark and all(_number(x, mark) == _number(x, mark) for x in text.split(mark) if x.strip()):
+            cells, names = text.split(mark), remark.split(mark)
+            numbers = [x for x in cells if _number(x, mark) == _number(x, mark)]
+            if remark and (
+                len(numbers) == len([x for x in cells if x.strip()]) or (numbers and len(cells) == len(names))
+            ):
                 yield remark
         if text:
             yield text

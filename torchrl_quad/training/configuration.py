@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import contextlib
 import functools
 import inspect
 import re
@@ -123,11 +125,31 @@ def own_recipe(config: str, settings: Mapping[str, Any]) -> str:
 
 
 def hydra_argument(argument: str) -> str:
-    """One argument in hydra's grammar: a sweep of wandb writes ``--env.wind={'mean': [1, 0, 0], 'gust': None}``."""
+    """One argument in hydra's grammar: a sweep of wandb writes ``--env.wind={'mean': [1, 0, 0], 'gust': None}``, and
+    an error of a log ``columns={"time": Columns(("t",), scale=1e-3)}, convention=frames.px4()``, each by itself."""
     if match := _SETTING.fullmatch(argument):
         argument = match[1]
     name, equals, value = argument.partition("=")
+    if name in ("columns", "convention") and "(" in value:
+        with contextlib.suppress(SyntaxError, ValueError):
+            value = str(_literal(ast.parse(value, mode="eval").body))
     return name + equals + _PYTHON.sub(_as_in_hydra, value) if equals and not name.startswith("-") else argument
+
+
+def _literal(node: ast.expr) -> Any:
+    """What Python writes of Columns and conventions, as mappings and words."""
+    match node:
+        case ast.Call(func=ast.Name(id="Columns"), args=[names], keywords=rest):
+            return {"names": _literal(names), **{str(x.arg): _literal(x.value) for x in rest}}
+        case ast.Call(func=ast.Attribute(attr="replace"), args=[convention], keywords=rest):
+            return {"name": _literal(convention), **{str(x.arg): _literal(x.value) for x in rest}}
+        case ast.Call(func=ast.Attribute(attr=convention), args=[], keywords=[]):
+            return convention
+        case ast.Dict(keys=keys, values=values):
+            return {_literal(k): _literal(x) for k, x in zip(keys, values, strict=True) if k is not None}
+        case ast.Tuple(elts=parts) | ast.List(elts=parts):
+            return [_literal(x) for x in parts]
+    return ast.literal_eval(node)
 
 
 def _as_in_hydra(match: re.Match[str]) -> str:

@@ -26,7 +26,8 @@ def main(cfg: DictConfig) -> None:
     trained, actor, normalizer = load_policy(checkpoint, trust=cfg.trust)
     logs = read_logs(cfg)
     motors = None if cfg.motor_command is None else MotorCommand(**cfg.motor_command)
-    with replacing_folder(Path(cfg.folder or checkpoint.parent / "adapted"), report_only) as folder:
+    place = Path(cfg.folder or checkpoint.parent / "adapted")
+    with replacing_folder(place, report_only) as folder:
         env = build_env(trained, cfg.num_envs, cfg.seed, compile=cfg.compile, normalizer=normalizer)
         adapter = Adapter(actor, env, motors, **{name: cfg[name] for name in ("max_kl", "steps", "num_envs", "seed")})
         print(f"Compiled in {adapter.warm_up():.0f} s.")
@@ -44,7 +45,7 @@ def main(cfg: DictConfig) -> None:
             }
             export_policy(found.policy, adapter.env, folder / "policy", origin=origin | {"revision": saved["revision"]})
         written = ", ".join(sorted(path.name for path in folder.iterdir()))
-    print(f"{cfg.folder or checkpoint.parent / 'adapted'}: {written}")
+    print(f"{place}: {written}")
 
 
 def report_only(folder: Path) -> None:

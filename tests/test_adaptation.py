@@ -117,7 +117,7 @@ def test_a_policy_that_no_step_improves_stays(log, hovering, monkeypatch):
     rising = iter([{"return": 1.0, "crash": 1.0}, {"return": 2.0, "crash": 1.0}])
     monkeypatch.setattr(Adapter, "_measure", lambda self, flight: next(rising))
     found = adapt(make_actor(hovering), hovering, [log, log], motors=MOTORS, **BRIEF)  # which agree
-    assert not found.changed and "where it crashes in 100% of the episodes" in found.reason
+    assert not found.changed and "the new policy crashes in 100% of the episodes" in found.reason
 
 
 def test_what_cannot_be_adapted_is_refused_by_name(hovering):

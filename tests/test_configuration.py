@@ -166,7 +166,7 @@ ALIASES = "a0: &a0 [1, 1]\n" + "".join(f"a{i + 1}: &a{i + 1} [*a{i}, *a{i}]\n" f
     (b"#" * 1_000_001, "has more than 1,000,000 bytes"),
     (b"mass: 1\nmass: 2", "line 2 names 'mass' for the second time"),
     (b"mass: !!int 1:30", "line 1 uses the tag"),
-    (b"[1]: 2", "line 1 names a value by seq, and a name must be a word"),
+    (b"[1]: 2", "line 1 names a value by a list or a mapping, and a name must be a word"),
     (b"mass: [1", "not a YAML file"),
     (b"mass: " + b"9" * 5000, "line 1 has a number of 5000 digits"),
     ids=["aliases", "deep", "latin-1", "large", "twice", "tag", "no name", "cut off", "long number"],

@@ -177,6 +177,7 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_th
     ("x.urdf", "<!DOCTYPE x [<!ENTITY a 'b'>]><robot>&a;</robot>", "declares entities or a type"),
     ("x.sdf", sdf(FRAME.replace("0.02<", "much<")), "expected 1 number, got 'much'"),
     ("x.xml", "<mujoco/>", "XML with the root <mujoco> is no URDF or SDF .* These can be read: URDF"),
+    ("x.json", "5", "this file is of no kind that is known. These can be read"),
     ("x.json", "[1]", "this file is of no kind that is known. These can be read"),
     (
         "x.json",
@@ -251,6 +252,23 @@ def test_rotors_are_found_by_their_names_and_axes_and_what_follows_from_a_given_
         renamed = flat
         for i, name in enumerate(names.split()):
             renamed = renamed.replace(f"motor{i}_link", f"quadrotor{name}_prop" if "/" in name else f"{name}_prop")
+        (tmp_path / "z.urdf").write_text(renamed)
+        named = load_drone(tmp_path / "z.urdf", torch.float64, motor_time_constant=0.05)
+        torch.testing.assert_close(named.rotor_positions, wanted.rotor_positions)
+    # Names of models, mounts and guards are no rotors, and what does not turn rotors does not matter.
+    besides = (
+        "<link name='motor_mount_back'><inertial/></link><transmission><joint name='a'/></transmission><!-- ${x} -->"
+    )
+    besides += "<joint name='world' type='floating'><parent link='w'/><child link='base_link'/></joint>"
+    besides += "<joint name='arm' type='revolute'><limit lower='0' upper='0'/><parent link='base_link'/>"
+    besides += "<child link='arm'/></joint>"
+    besides += "<joint name='m' type='fixed'><parent link='arm'/><child link='motor0_link'/></joint>"
+    (tmp_path / "z.urdf").write_text(flat.replace("</robot>", besides + "</robot>"))
+    assert len(load_drone(tmp_path / "z.urdf", torch.float64, motor_time_constant=0.05).rotor_positions) == 4
+    for form in ("motor_{}/link", "x::motor_{}::link", "quadrotor/motor_{}"):
+        renamed = flat
+        for i in range(4):
+            renamed = renamed.replace(f"motor{i}_link", form.format(i))
         (tmp_path / "z.urdf").write_text(renamed)
         named = load_drone(tmp_path / "z.urdf", torch.float64, motor_time_constant=0.05)
         torch.testing.assert_close(named.rotor_positions, wanted.rotor_positions)

@@ -204,6 +204,8 @@ def test_a_sweep_hands_over_mappings_and_null_as_people_write_them(train, tmp_pa
         """columns={"time": Columns(('t(s)',), scale=0.001), 'x': None}""",
         "columns={time: {names: ['t(s)'], scale: 0.001}, x: null}",
     ),
+    ("columns={'x': Columns('a', 2)}", "columns={x: {names: 'a', scale: 2}}"),
+    ("max_gap=0.1", "++reading.max_gap=0.1"),
     ("convention=dataclasses.replace(frames.px4(), xyzw=True)", "convention={name: 'px4', xyzw: True}"),
     ("--actor.num_cells=[32, 32]", "actor.num_cells=[32, 32]"),
     ("env.wind={mean: [1, 0, 0]}", "env.wind={mean: [1, 0, 0]}"),

@@ -197,6 +197,10 @@ def test_losses_take_a_policy_that_sees(recurrent, noise_correlation):
         for loss in (BPTTLoss(actor), BPTTLoss(actor, clip_action_gradient=1e12))
     ]
     torch.testing.assert_close(*grads)
+    if recurrent:
+        clipped = BPTTLoss(actor, clip_action_gradient=1.0).loss_actor(rollout)[0]
+        with pytest.raises(RuntimeError, match="has first derivatives only. .* without a memory"):
+            torch.autograd.grad(clipped, list(actor.parameters()), create_graph=True)
     over = rollout[:, :2].clone(recurse=False)  # all have crashed: there is no value after the end
     over["next"].update({name: torch.ones_like(over["next", name]) for name in ("done", "terminated")})
     assert ABPTLoss(actor, qvalue)(over)["loss_actor"].isfinite()

@@ -17,7 +17,7 @@ from torchrl.envs.utils import ExplorationType
 
 from torchrl_quad.adaptation.fit import FlightFit, Flown, fit_flight
 from torchrl_quad.data import differentiable_rollout, restart
-from torchrl_quad.data.unwrap import base_env, leaf, memory_keys
+from torchrl_quad.data.unwrap import base_env, leaf
 from torchrl_quad.dynamics import MotorCommand, Quadrotor
 from torchrl_quad.envs import QuadrotorEnv
 from torchrl_quad.envs.any_drone import AnyDrone
@@ -64,7 +64,7 @@ class Adapter:
     - The flights agree with each other and with the drone, as :func:`~torchrl_quad.adaptation.fit_flight` checks.
     - They tell what each rotor gives, and the fit predicts what was held out of them better.
     - In the fitted simulator, from fresh starts, the new policy has the greater return, crashes no more often, and in
-      fewer than half of the episodes.
+      at most half of the episodes.
 
     Each call fits its own flights alone: give earlier ones of the same wind again. Disturbances of your own stay in
     the fitted simulator; leave out those that the flights show as well, as a random mass.
@@ -125,7 +125,7 @@ class Adapter:
         if isinstance(base.disturbances.get("randomize"), AnyDrone):
             raise Unsupported(
                 "Adapter: a policy for any drone (randomize='any') acts on no nominal drone, which a fit could differ "
-                "from. Its memory adapts it in flight."
+                "from. Such a policy adapts in flight, by its memory."
             )
         if "depth" in policy.in_keys:
             raise Unsupported("Adapter: this policy reads images, which no log holds. Train with actor.vision=false.")
@@ -179,9 +179,12 @@ class Adapter:
         before, after = map(self._measure, flights)
         kl = float(TrustRegion(new, 1.0).divergence(flights[0]))
         clock.lap("test")
-        if after["return"] <= before["return"] or after["crash"] > min(before["crash"], MOST_CRASHES):
+        why = ""
+        if after["return"] <= before["return"]:
             why = "no step made the policy better in the fitted simulator"
-            why += f", where it crashes in {before['crash']:.0%} of the episodes" if before["crash"] else ""
+        elif after["crash"] > min(before["crash"], MOST_CRASHES):
+            why = f"in the fitted simulator the new policy crashes in {after['crash']:.0%} of the episodes"
+        if why:
             return self._kept(why, fit, clock, before, flights)
         self.policy = new
         reason = f"the return in the fitted simulator rose from {before['return']:.4g} to {after['return']:.4g}"
@@ -196,9 +199,7 @@ class Adapter:
         optimizer = torch.optim.Adam(actor.parameters(), self.lr, betas=(0.7, 0.95))
         schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.1, self.steps)
         reference = self._fly(old, self.seed)
-        best, best_score = old, _score(reference)
-        if not memory_keys(old):  # which is built up from step to step
-            reference = cast(TensorDictBase, reference[:, ::_EVERY])
+        best, best_score, reference = old, _score(reference), cast(TensorDictBase, reference[:, ::_EVERY])
         for step in range(1, self.steps + 1):
             rollout, end = self._horizon(actor, carry)
             optimizer.zero_grad()

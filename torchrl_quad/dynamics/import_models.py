@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
@@ -28,9 +29,9 @@ from torchrl_quad.dynamics.import_formats import (
 )
 from torchrl_quad.errors import UserValueError, one_line, shown
 
-# What the name of a rotor's link says beside rotor, prop or motor, {}; and what it does not say.
-_ROTOR = r"{0}\D{{0,20}}\d|\d_?{0}|(left|right|front|rear|back).*{0}|{0}.*(left|right|front|rear|back)"
-_NO_ROTOR = re.compile("guard|(quad|hexa|octo|multi)_?rotor")
+# What the name of a rotor's link says beside rotor, prop or motor, {0}: a number, or else where it is.
+_NUMBERED, _PLACED = r"{0}\D{{0,20}}\d", r"\d_?{0}|(left|right|front|rear|back).*{0}|{0}.*(left|right|front|rear|back)"
+_TURNING = ("revolute", "continuous", "prismatic", "universal", "ball", "screw")  # joints
 DEPTH = 20  # of models, joints and frames within each other
 # Of each link: its mass, the frame of its centre of mass, its inertia there (NaN where nothing is said), and two
 # directions: of its z axis, and of the axis that it turns about.
@@ -40,7 +41,7 @@ Links = dict[str, tuple[float, Array, Array, Array]]
 def read_xml(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
     """Of a URDF or SDF: its path, its kind, what it says, and which of its attributes were not read."""
     root, links, plugins = _xml(path), Links(), list[ET.Element]()
-    models = [root] if root.tag == "model" else [*root.iterfind("model"), *root.iterfind("world/model")]
+    drone, models = root, [root] if root.tag == "model" else [*root.iterfind("model"), *root.iterfind("world/model")]
     if root.tag == "robot":
         _add_urdf(root, links, str(path))
         plugins += root.iter("plugin")
@@ -58,23 +59,17 @@ def read_xml(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
     )
     short = {re.split("/|::", name)[-1]: name for name in links}
     rotors = [short.get(re.split("/|::", (x.findtext("linkName") or "").strip())[-1], "") for x in motors]
-    for word in ("rotor", "prop", "motor"):
-        named = [x for x in short if re.search(_ROTOR.format(word), x.lower()) and not _NO_ROTOR.search(x.lower())]
-        rotors = rotors or [short[x] for x in sorted(named, key=_digits)]
+    plain = {x: re.sub("(quad|hexa|octo|multi)_?rotor", "", x.lower()) for x in links}
+    for name, word in itertools.product((_NUMBERED, _PLACED), ("rotor", "prop", "motor")):
+        named = [x for x, said in plain.items() if re.search(name.format(word), said) and "guard" not in said]
+        rotors = rotors or sorted(named, key=_digits)
     if "" in rotors:
         raise UserValueError(f"{path}: the linkName of a motor is that of no link with an <inertial>. Add it.")
     lifts = [x for x in plugins if "liftdrag" in re.sub(r"\W|_", "", x.get("filename", "").lower())]
     blades = {re.split("/|::", x)[-1] for x in rotors}
     if any(re.split("/|::", (x.findtext("link_name") or "").strip())[-1] not in blades for x in lifts):
         raise UserValueError(f"{path}: it has wings (LiftDrag), and a drone here has rotors alone. Take a multicopter.")
-    joints = {child: (parent, joint) for joint in root.iter("joint") for parent, child in [_ends(joint)]}
-    for rotor in blades & joints.keys():
-        above = joints[rotor][0]
-        for _ in range(DEPTH):
-            if above in joints and joints[above][1].get("type") != "fixed":
-                why = f"the joint {shown(joints[above][1].get('name'))} turns the rotor {shown(rotor)}"
-                raise UserValueError(f"{path}: {why}, and rotors here are fixed to the body. Take another drone.")
-            above = joints[above][0] if above in joints else ""
+    _check_fixed(drone, blades, path)
     found = _body(links, rotors, bool(motors)) | given
     _add_motors(found, motors, str(path), given)
     if (said := root.find("properties")) is not None and root.tag == "robot":
@@ -85,11 +80,24 @@ def read_xml(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
     return str(path), "URDF" if root.tag == "robot" else "SDF", found, []
 
 
-def _ends(joint: ET.Element) -> list[str]:
-    """The links that a joint of URDF or SDF joins, parent and child."""
-    ends = [joint.find(name) for name in ("parent", "child")]
-    names = ["" if x is None else x.get("link") or x.text or "" for x in ends]
-    return [re.split("/|::", name.strip())[-1] for name in names]
+def _check_fixed(drone: ET.Element, rotors: set[str], path: Path) -> None:
+    """Refuse rotors that a joint turns against the body."""
+    joints = {}
+    for joint in drone.iter("joint"):
+        ends = [joint.find(name) for name in ("parent", "child")]
+        names = ["" if x is None else x.get("link") or x.text or "" for x in ends]
+        parent, child = (re.split("/|::", name.strip())[-1] for name in names)
+        if parent and child:
+            joints[child] = parent, joint
+    for rotor in rotors:
+        link = joints.get(rotor, ("",))[0]  # by a joint of its own, which spins it
+        for _ in range(DEPTH):
+            link, joint = joints.get(link, ("", None))
+            ends = [] if joint is None else [*joint.iter("limit")]
+            limits = {x.get(k) or x.findtext(k) for x in ends for k in ("lower", "upper")}
+            if joint is not None and joint.get("type") in _TURNING and len(limits) != 1:
+                why = f"the joint {shown(joint.get('name'))} turns the rotor {shown(rotor)}"
+                raise UserValueError(f"{path}: {why}, and rotors here are fixed to the body. Take another drone.")
 
 
 def _digits(name: str | None) -> list[int]:
@@ -101,14 +109,18 @@ def _xml(path: Path) -> ET.Element:
     text = text[max(text.find("<?xml"), 0) :]  # before which Gazebo allows comments
     if re.match(r"\s*<(!doctype )?html", text.lower()):
         raise UserValueError(f"{path}: this is a web page. Download the file itself, which GitHub calls raw.")
-    if re.search(r'<xacro:|"\$\{', text):
-        raise UserValueError(f"{path}: a template of xacro. Expand it first: xacro FILE > NEW_FILE.urdf.")
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # a few lines of which can mean billions of characters
         raise UserValueError(f"{path}: it declares entities or a type. Write the values out instead.")
+    expand = UserValueError(f"{path}: a template of xacro. Expand it first: xacro FILE > NEW_FILE.urdf.")
     try:
-        return ET.fromstring(text)
+        root = ET.fromstring(text)
     except (ET.ParseError, ValueError) as error:
+        if "unbound prefix" in str(error) and "<xacro:" in text:
+            raise expand from None
         raise UserValueError(f"{path}: not an XML file: {one_line(error)}.") from None
+    if any("xacro" in x.tag or "${" in "".join(x.attrib.values()) for x in root.iter()):
+        raise expand
+    return root
 
 
 def _numbers(text: str | None, n: int, source: str) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -183,7 +184,7 @@ def _read(drone: Any, entry: str | None, fields: Mapping[str, Any]) -> tuple[str
         return read_xml(Path(drone), usable(fields))
     if suffix == ".json":
         source, data = str(drone), read_json(Path(drone))
-    elif suffix not in ("", ".yaml", ".yml", ".toml") and Path(drone).is_file():
+    elif suffix not in ("", ".yaml", ".yml", ".toml") and os.path.isfile(drone):
         raise UserValueError(f"{drone}: no drone can be read from a {suffix} file. {READABLE}")
     else:
         source, data = read_fields(drone)
@@ -198,8 +199,8 @@ def _read(drone: Any, entry: str | None, fields: Mapping[str, Any]) -> tuple[str
     if (entry is None and len(drones) > 1) or (entry is not None and entry not in drones):
         names = f"entry={next(iter(drones))!r} or another of {shown(list(drones))}"
         raise UserValueError(f"{source}: choose one drone of the file, by {names}; got {shown(entry)}.")
-    own = set(FIELDS) & set(data) if isinstance(data, Mapping) else set()
-    if not drones and not isinstance(drone, Mapping) and 2 * len(own) <= len(data):  # others, too, say "mass"
+    own = set(FIELDS) & set(data) if isinstance(data, Mapping) else set()  # others, too, say "mass"
+    if not drones and not isinstance(drone, Mapping) and not (own and 2 * len(own) > len(data)):
         raise UserValueError(f"{source}: this file is of no kind that is known. {READABLE}")
     if not drones:
         return source, "", {k: (v, "") for k, v in data.items()}, []

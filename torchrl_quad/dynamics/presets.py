@@ -3,6 +3,7 @@
 import copy
 import functools
 import numbers
+import os
 import re
 import tomllib
 from collections.abc import Hashable, Mapping, Sequence
@@ -41,7 +42,7 @@ def read(kind: str, preset: str | Path | Mapping, folder: Traversable | None = N
         source, path = f"{preset}.yaml", known[preset]
     elif isinstance(preset, Path) or (isinstance(preset, str) and preset.lower().endswith((".yaml", ".yml", ".toml"))):
         source, path = str(preset), Path(preset)
-    elif isinstance(preset, str) and Path(preset).is_file():
+    elif isinstance(preset, str) and os.path.isfile(preset):
         raise UserValueError(
             f"{preset}: a {kind} is read from YAML or TOML, and this is neither. Write its numbers so."
         )
@@ -118,7 +119,8 @@ class _Loader(yaml.SafeLoader):
         for key, value in node.value:
             where = f"line {key.start_mark.line + 1} names"
             if not isinstance(key, yaml.ScalarNode) or not key.value:
-                raise UserValueError(f"{where} a value by {key.tag.rsplit(':')[-1]}, and a name must be a word.")
+                kind = "nothing" if isinstance(key, yaml.ScalarNode) else "a list or a mapping"
+                raise UserValueError(f"{where} a value by {kind}, and a name must be a word.")
             name = key.value  # as it stands there: on and 1, too
             if name in found:
                 raise UserValueError(f"{where} {shown(name)} for the second time. Leave one of them out.")

@@ -134,9 +134,9 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
     own |= {"start_range": 0.05, "floor": box[0][2], "notes": notes}
     if len(drones) > 1:
         notes.append(f"{len(drones)} drones race there: the first is read")
-    order = [int(x) for x in track.get("gate_order", range(1, len(centres) + 1))]
+    order = track.get("gate_order") or [*range(1, len(centres) + 1)]
     gates = [abs(x) - 1 for x in order]
-    if not gates or not 0 <= min(gates) <= max(gates) < len(centres):
+    if any(x not in range(len(centres)) for x in gates):
         raise UserValueError(f"{source}: gate_order names gates from 1 to {len(centres)}; got {shown(order)}.")
     centres, rotations = centres[gates], from_euler(as_array([gate["rpy"] for gate in track["gates"]]))[gates]
     back = from_euler(np.array([0.0, 0.0, math.pi]))  # a negative number is a gate that is flown backwards
@@ -149,7 +149,7 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
         notes.append("gates stand anew in each episode, by the rules of random tracks; no poles")
         return own
     spreads = values["env"].get("randomizations") or values["env"].get("randomization") or {}
-    drawn = {name: _spread(source, x) for name, x in spreads.items()}
+    drawn = {x: _spread(source, spreads[x]) for x in ("gate_pos", "gate_rpy", "obstacle_pos") if x in spreads}
     if len(set(gates)) < len(gates) and {"gate_pos", "gate_rpy"} & drawn.keys():
         raise UserValueError(
             f"{source}: its gate_order passes a gate twice, and gates are moved at random, each passage by itself. "

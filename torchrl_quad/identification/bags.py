@@ -51,9 +51,9 @@ def read_bag(path: Path, columns: Asked) -> tuple[list[Stream], Layout, list[str
     except UserError:
         raise
     except Exception as error:  # rosbags raises whatever its parsers meet
-        if kind := re.search(r"\w+/msg/\w+", str(error)):
+        if kind := re.fullmatch(r"'?(\w+/msg/\w+)'?", str(error)):
             raise UnreadableLog(
-                f"{path.name} does not define its messages {kind[0]}, as bags of ROS 2 before Iron do not. Where "
+                f"{path.name} does not define its messages {kind[1]}, as bags of ROS 2 before Iron do not. Where "
                 "they are installed, convert it to MCAP, which does: ros2 bag convert."
             ) from error
         raise UnreadableLog(

@@ -46,7 +46,7 @@ def read_streams(path: Path, columns: Asked) -> Read:
     """The streams of a file, what is where in it, and notes. Its first bytes tell the kind of file."""
     if not path.exists():
         raise UnreadableLog(f"{path} does not exist. Give the path of a log.")
-    if path.is_dir() and not any(x.suffix in (".db3", ".mcap", ".bag", ".zstd") for x in path.iterdir()):
+    if path.is_dir() and not any(x.suffix in (".db3", ".mcap", ".zstd") for x in path.iterdir()):
         raise UnreadableLog(f"{path} is a folder without a ROS bag. Give the path of the log in it.")
     if path.is_dir():
         return read_bag(path, columns)
@@ -187,11 +187,9 @@ def _rows(lines: Iterator[bytes], name: str) -> Iterator[str]:
         text = text.partition("#")[0].strip(" ") if begun and "#" in text else text
         if not begun and text:
             begun, mark = True, _mark(remark)
-            cells, names = text.split(mark), remark.split(mark)
-            numbers = [x for x in cells if _number(x, mark) == _number(x, mark)]
-            if remark and (
-                len(numbers) == len([x for x in cells if x.strip()]) or (numbers and len(cells) == len(names))
-            ):
+            cells, names = (x.strip(mark).split(mark) for x in (text, remark))
+            numbers, words = (sum(_number(x, mark) == _number(x, mark) for x in row) for row in (cells, names))
+            if remark and (numbers == len(cells) or (numbers and not words and len(cells) == len(names))):
                 yield remark
         if text:
             yield text

@@ -437,8 +437,8 @@ class Replay(PlainTanhGaussian):
         Single steps (n) that are no rollout are each remembered as they were flown.
         """
         has_time = tensordict.ndim > 1 or tensordict.names[-1] == "time"
-        if (parts := self.actor.parts()) is not None:
-            loc, scale = PlainParts(self.actor, parts).recall(tensordict, tensordict.shape[-1] if has_time else 1)
+        if (plain := self.actor.plain()) is not None and not torch._C._are_functorch_transforms_active():
+            loc, scale = plain.recall(tensordict, tensordict.shape[-1] if has_time else 1)
             return loc.view(*tensordict.shape, -1), scale.view(*tensordict.shape, -1)
         with set_recurrent_mode(has_time):
             read = cast(TensorDictBase, self.actor.get_dist_params(tensordict.select(*self.actor.in_keys).detach()))

@@ -13,13 +13,12 @@ from tensordict.nn import NormalParamExtractor, TensorDictSequential, dispatch
 from tensordict.nn.utils import biased_softplus
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 from torch.func import vjp
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 
 from torchrl_quad.data.unwrap import leaf
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.errors import UserValueError, WrongState
 
 
 class GaussianHead(NormalParamExtractor):
@@ -426,9 +425,13 @@ class Recall(torch.autograd.Function):
         return torch.stack(recalled)
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, of_recalled: Tensor) -> tuple[Tensor | None, ...]:  # pyrefly: ignore[bad-override]  # 1 output
         """The gradients of ``read``, of the memory's weight and bias."""
+        if torch.is_grad_enabled():  # so it is only under create_graph=True
+            raise WrongState(
+                "The loss of a policy with memory has first derivatives only. For second ones (create_graph=True) "
+                "build the policy without a memory."
+            )
         lasts, weight, *kept = ctx.saved_tensors
         of_h, of_read, of_own = torch.zeros_like(of_recalled[0]), [], []
         for i in reversed(range(len(lasts))):

@@ -130,8 +130,10 @@ def hydra_argument(argument: str) -> str:
     if match := _SETTING.fullmatch(argument):
         argument = match[1]
     name, equals, value = argument.partition("=")
+    if name in ("clearance", "max_gap", "min_duration", "onboard"):  # arguments of read_log
+        name = f"++reading.{name}"
     if name in ("columns", "convention") and "(" in value:
-        with contextlib.suppress(SyntaxError, ValueError):
+        with contextlib.suppress(SyntaxError, TypeError, ValueError):
             value = str(_literal(ast.parse(value, mode="eval").body))
     return name + equals + _PYTHON.sub(_as_in_hydra, value) if equals and not name.startswith("-") else argument
 
@@ -139,11 +141,12 @@ def hydra_argument(argument: str) -> str:
 def _literal(node: ast.expr) -> Any:
     """What Python writes of Columns and conventions, as mappings and words."""
     match node:
-        case ast.Call(func=ast.Name(id="Columns"), args=[names], keywords=rest):
-            return {"names": _literal(names), **{str(x.arg): _literal(x.value) for x in rest}}
+        case ast.Call(func=ast.Name(id="Columns"), args=given, keywords=rest):
+            named = dict(zip(("names", "scale", "offset"), map(_literal, given), strict=False))
+            return named | {str(x.arg): _literal(x.value) for x in rest}
         case ast.Call(func=ast.Attribute(attr="replace"), args=[convention], keywords=rest):
             return {"name": _literal(convention), **{str(x.arg): _literal(x.value) for x in rest}}
-        case ast.Call(func=ast.Attribute(attr=convention), args=[], keywords=[]):
+        case ast.Call(func=ast.Attribute(attr=convention), args=[]):
             return convention
         case ast.Dict(keys=keys, values=values):
             return {_literal(k): _literal(x) for k, x in zip(keys, values, strict=True) if k is not None}

@@ -52,6 +52,14 @@ class Section(BaseModel):
 ACTIVATIONS = "CELU ELU GELU Hardswish LeakyReLU Mish PReLU ReLU SELU SiLU Sigmoid Softplus Softsign Tanh"  # torch.nn
 _Channels = Annotated[list[Annotated[int, Field(ge=1, le=4096)]], Field(min_length=1, max_length=8)]
 _Frames = Literal["px4", "ardupilot", "betaflight", "crazyflie", "mavros", "mujoco", "rotorpy", "crazyflow"]
+
+
+class _Convention(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    name: _Frames
+    xyzw: bool = False
+
+
 _Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
 _Resume = accepted(lambda x: x == "auto" or Path(x).is_file(), "the path of a checkpoint.pt that exists, or auto")
 
@@ -122,7 +130,7 @@ SETTINGS: dict[str, tuple[Any, str]] = {
     "target": (Literal["crazyflie", "px4", "betaflight"] | None, "The firmware to write code for."),
     "logs": (Annotated[list[str], Field(min_length=1)], "The paths of flights of one drone, in a list."),
     "columns": (str | dict[str, Any] | None, "Which columns of the logs are which quantity, as for read_log."),
-    "convention": (_Frames | dict[Literal["name", "xyzw"], _Frames | bool] | None, "The frames of the logs."),
+    "convention": (_Frames | _Convention | None, "The frames of the logs."),
     "drone": (str | dict[str, Any], "Where the fit starts: a preset, a YAML file, or a mapping."),
     "mass": (Positive | None, "The mass in kg, from a scale; null if unknown."),
     "reading": (dict[str, Any] | None, "Other arguments of read_log."),

@@ -71,7 +71,7 @@ class RacingEnv(QuadrotorEnv):
     A point is passed when the straight line of a control step comes within 0.3 m of it, a gate with a direction when
     that line crosses its plane, from behind, within its opening. The reward of that step is about the gate after it.
 
-    Start: level and at rest, uniformly within 0.2 m of one of four points along each axis, each before another gate.
+    Start: level and at rest before a gate drawn at random, uniformly within 0.2 m along each axis of its start point.
     State added: ``gate`` (1), the index of the next; ``target`` (3) [m], its centre; ``gate_passed`` (1), whether this
     step passed one; ``gates_passed`` (1) in this episode; ``pass_step`` (gates), when each was passed last, -1 for
     never; ``lap_time`` (1) [s], of the last full lap, 0 before; ``frame_touched`` (1), where gates have frames; and

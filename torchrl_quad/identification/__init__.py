@@ -1,4 +1,4 @@
-"""From flights to parameters: logs of real drones in one schema."""
+"""Read logs of real flights in one schema, and fit drones to them."""
 
 from torchrl_quad.identification.errors import (
     ClockJumpsBack,

@@ -79,8 +79,8 @@ def identify(
 
     Raises:
         TooShort: no piece of a flight is long enough for a window, or there are too few windows for the unknowns.
-        ValueError: a field cannot be fitted, or the drone is wrong, or a known value: its rotors turn it another way
-            than the flights, or a fifth of its weight or more is left over.
+        ValueError: a field cannot be fitted; the rotors would turn the drone another way than in the flights; or the
+            fit leaves a force of a fifth of the weight or more, so that the mass or the thrust is wrong.
     """
     logs = prediction.as_logs(log, "identify")
     if draws == 1:

@@ -47,10 +47,10 @@ class ABPTLoss(PathwiseCriticLoss):
         num_qvalue_nets: the critics made from it, each initialised independently, whose smallest value counts.
         n_step_return: whether J includes J_N.
         zero_step_return: whether J includes J_0.
-        simulated_steps: control steps that the return of the start flies through the simulator before it asks the
-            critic: J_0 is then sum_(t<k) gamma^t r_t + gamma^k V(s_k), with V(s) = Q(s, a) and a sampled. Its gradient
-            in a_0 is the simulator's, not the critic's, which may be noise. With an action delay of d steps a_0 moves
-            nothing before step d + 1: take 1 + d or more. J_0 ends with its segment at the latest.
+        simulated_steps: simulated control steps in the 0-step return before the critic takes over: J_0 is then
+            sum_(t<k) gamma^t r_t + gamma^k V(s_k), with V(s) = Q(s, a) and a sampled. Its gradient in a_0 is the
+            simulator's, not the critic's, which may be noise. With an action delay of d steps a_0 moves nothing before
+            step d + 1: take 1 + d or more. J_0 ends with its segment at the latest.
         delay_qvalue: whether the critics have target networks, updated with :class:`torchrl.objectives.SoftUpdate`.
         **kwargs: as for :class:`~torchrl_quad.objectives.PathwiseCriticLoss`.
     """

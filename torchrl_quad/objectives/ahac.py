@@ -46,14 +46,13 @@ class AHACLoss(SHACLoss):
     Args:
         actor_network: the policy that flew the rollout, whose action is a TanhNormal or an IndependentNormal.
         horizon: control steps of the first rollout.
-        min_horizon: the shortest horizon; null for a quarter of the first.
-        max_horizon: the longest horizon; null for twice the first.
-        max_stiffness: the bound on the growth of action gradients along a horizon, beyond which it gets shorter; 1.5 to
-            5 are usual.
+        min_horizon: the shortest horizon; None for a quarter of the first.
+        max_horizon: the longest horizon; None for twice the first.
+        max_stiffness: the bound on the stiffness, above which the horizon gets shorter; 1.5 to 5 are usual.
         horizon_lr: the share by which the horizon may change in an iteration.
-        gradient_lmbda: 1 climbs J. Below, each action climbs its own lambda-return, with the critic's value after every
-            step, as in Dreamer (Hafner et al. 2020, arXiv:1912.01603). The rewards of 1 / (1 - lmbda) steps count, and
-            what jumps, such as a target, counts by the critic. 0.98 is usual.
+        gradient_lmbda: at 1 actions follow the gradient of J, below 1 each that of its own lambda-return, with the
+            critic's value after every step, as in Dreamer (Hafner et al. 2020, arXiv:1912.01603). The rewards of
+            1 / (1 - lmbda) steps count, and the critic accounts for what jumps, such as a target. 0.98 is usual.
         **kwargs: as for :class:`SHACLoss`.
     """
 

@@ -57,8 +57,8 @@ class HybridLoss(SHACLoss):
             advantage and of the critic's targets is ``make_value_estimator(lmbda=...)``.
         clip_epsilon: how far the ratio of probabilities may move from 1; 0.2 is usual.
         entropy_coeff: the weight of the entropy bonus, next to advantages of standard deviation 1; 0 for none.
-        clip_action_gradient: the longest gradient in one action, in running medians of their lengths; null for none.
-        reduction: mean, sum or none, over samples; null is mean, as in TorchRL.
+        clip_action_gradient: the longest gradient in one action, in running medians of their lengths; None for none.
+        reduction: mean, sum or none, over samples; None is mean, as in TorchRL.
         loss_function: the distance of the critic from its targets: l2, its square; l1; or smooth_l1.
         decay: the share of the running weight that a rollout leaves as it is.
         average: of a scalar over the processes that train together, if there are several.

@@ -46,10 +46,10 @@ class PathwiseLoss(LossModule):
             a fixed noise the entropy may never reach its target, and "auto" keeps growing.
         target_entropy: where alpha=auto holds the entropy: a number, or auto for minus the number of action entries.
         alpha_init: what alpha=auto starts from.
-        clip_action_gradient: the longest gradient in one action, in running medians of their lengths; null for no
+        clip_action_gradient: the longest gradient in one action, in running medians of their lengths; None for no
             bound. 1 to 5 keep tumbling drones from outweighing all others. Needs a policy whose action is TorchRL's
             TanhNormal or IndependentNormal, without dropout. An entropy bonus then counts at fixed states.
-        reduction: mean or sum over environments (over samples for a critic), or none; null is mean, as in TorchRL.
+        reduction: mean or sum over environments (over samples for a critic), or none; None is mean, as in TorchRL.
 
     Steps that a collector's ``("collector", "mask")``, bool (*, horizon), marks as False do not count: such a step has
     no reward, ends its segment, and is no target of a critic.

@@ -33,7 +33,7 @@ class TrustRegion:
 
     Args:
         actor: a policy of :func:`~torchrl_quad.make_actor`; the bound is on its normal distributions before the tanh.
-        max_kl: the largest divergence of an update, 0.01 to 0.1 are usual; null for no bound, which measures nothing.
+        max_kl: the largest divergence of an update, 0.01 to 0.1 are usual; None for no bound, which measures nothing.
         min_scale: the least standard deviation that the divergence is computed with. A policy whose noise the gradient
             has taken away could otherwise not move at all within a bound.
         average: of a scalar over the processes that train together, if there are several.

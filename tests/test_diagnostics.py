@@ -159,6 +159,11 @@ class DoubtfulEnv(HoveringEnv):
         return {**super().reward_terms(state), "arrival": arrival, "near": near}
 
 
+class CrashedEnv(HoveringEnv):
+    def is_crash(self, state):
+        return torch.ones_like(state["step"], dtype=torch.bool)
+
+
 NO_ATTITUDE = {"attitude": 0.0}
 
 
@@ -167,6 +172,7 @@ NO_ATTITUDE = {"attitude": 0.0}
     (DoubtfulEnv, {"arrival": 1.0}, "success ends an episode and pays 1.1, .*: loitering pays more"),
     (DoubtfulEnv, {"near": 10.0, "width": 0.08}, "'near' is flat in .* of the flights, those in which it pays least"),
     (HoveringEnv, {"survival": 0.0, **NO_ATTITUDE}, "a step pays -0.0.* a crash was not seen: dying is cheap"),
+    (CrashedEnv, {}, "all episodes end in their first step: look at the start, is_crash and is_success"),
     (HoveringEnv, {}, "'attitude' is less than a thousandth of return and gradient"),
 )
 def test_the_audit_says_in_words_what_keeps_a_policy_from_learning_a_task(task, weights, trap):
@@ -282,6 +288,7 @@ def test_diagnostics_look_at_the_pendulum_of_torchrl():
 
 
 AUDITS = {
+    r"'own' is not finite in 2 of 6 steps. Look for a logarithm": lambda r, a: audit_reward(r, a, terms_key="broken"),
     r"do not add up to the reward: they are off by up to 12": lambda r, a: audit_reward(r, a, reward_key="scaled"),
     r"'short' has shape \(2, 3\), and the reward \(2, 3, 1\)": lambda r, a: audit_reward(r, a, terms_key="own"),
     "reads .*'terms'.* which is not in the rollout. Name the terms": lambda r, a: audit_reward(r, a, terms_key="terms"),
@@ -297,6 +304,7 @@ AUDITS = {
 @pytest.mark.parametrize("message", AUDITS)
 def test_what_cannot_be_audited_is_refused_with_advice(message):
     rollout, actor = make_rollout()
+    rollout["broken", "own"] = torch.tensor([0.0, float("nan"), 0.0]).expand(2, 3).unsqueeze(-1)
     rollout["scaled"] = 2.0 * rollout["next", "reward"]  # 6, -6 and -24
     rollout["own"] = TensorDict({"short": torch.ones(2, 3)}, [2, 3])
     refuses(message, AUDITS[message], rollout, actor, error=(ValueError, RuntimeError))

@@ -76,6 +76,18 @@ def test_a_bad_value_is_refused_by_name(kwargs, message):
     ("observe", lambda _, s: s["position"][:, 0], r"observe\(state\) must be a tensor \(4, k\), torch.float32"),
     ("reward_terms", lambda _, s: {"near": -s["position"]}, r"reward_terms\(state\)\['near'\] must .* keepdim"),
     ("reward_terms", lambda _, s: {"near": -s["position"][:, 0]}, r"\['near'\] must .*; got \(4,\)"),
+    ("reward_terms", lambda _, s: {"near": s["step"]}, r"got \(4, 1\), torch.int64. Convert it: .to\(self.dtype\)"),
+    (
+        "reward_terms",
+        lambda _, s: {"near": s["velocity"].mul_(0.0)[:, :1]},
+        "reward_terms writes into 'velocity' in place",
+    ),
+    (
+        "is_crash",
+        lambda _, s: s["vel"] > 0.0,
+        "is_crash asks for 'vel', which is no entry of the state .* has: position",
+    ),
+    ("metrics", lambda _, s: {"far": s["step"]}, r"\['far'\] must be a tensor \(4, 1\), torch.float32; got"),
     ("reward_terms", lambda _, s: -s["position"], r"reward_terms\(state\) must be a mapping .*; got Tensor"),
     ("advance", lambda _, p, s: None, r"advance\(previous, state\) must be a mapping .*; got NoneType"),
     ("metrics", lambda _, s: {"far": s["position"]}, r"metrics\(state\)\['far'\] must be a tensor \(4, 1\)"),

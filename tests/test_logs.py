@@ -147,12 +147,15 @@ def test_a_run_with_diagnostics_learns_the_same_bit_for_bit_and_logs_them(recipe
 
 
 def test_an_update_that_is_not_finite_is_left_out_and_counted(train, tmp_path, monkeypatch):
+    said = []
+    monkeypatch.setattr(torchrl_logger, "warning", said.append)
     poison(monkeypatch, 0, 3, 4)
     checkpoint = train("bptt", tmp_path, "env.drone=small_racer")
     saved = yaml.safe_load((tmp_path / "config.yaml").read_text())  # the configuration goes along with the results
     assert saved["env"]["drone"] == "small_racer" and OmegaConf.create(checkpoint["config"]) == OmegaConf.create(saved)
     assert checkpoint["revision"] == json.loads((tmp_path / "summary.json").read_text())["revision"]
     assert [row["grad/skipped"] for row in checkpoint["rows"]] == [1, 2, 3, 3]
+    assert [x.partition(":")[0] for x in said] == ["An update was skipped in iteration 0"]
     assert all(parameter.isfinite().all() for parameter in checkpoint["best"]["actor"].values())
     assert checkpoint["stateful"][1]["state"][0]["step"] == 8 - 3
     assert all(row["grad/actor"] != row["grad/actor"] or row["grad/actor"] > 0 for row in checkpoint["rows"])

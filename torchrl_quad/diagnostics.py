@@ -140,6 +140,12 @@ def audit_reward(
     for name, term in terms.items():
         if term.shape != shape:
             raise UserValueError(f"The term {name!r} has shape {tuple(term.shape)}, and the reward {shape}.")
+    for name, term in terms.items():
+        if broken := int((~term.isfinite()).sum()):
+            raise UserValueError(
+                f"The term {name!r} is not finite in {broken} of {term.numel()} steps. Look for a logarithm, a root or "
+                "a quotient near zero, and keep its argument away from there: .clamp_min(1e-6)."
+            )
     gap = (total(terms.values()) - reward).detach().abs()
     worst = (gap / (1.0 + total(term.detach().abs() for term in terms.values()))).max().item()
     if not worst <= tolerance:
@@ -182,6 +188,8 @@ def audit_reward(
             traps += _flat(name, terms[name], returns[name], grads[name][len(sources) :])
             if max(x.return_share, x.gradient_share) < 1e-3:
                 traps.append(f"{name!r} is less than a thousandth of return and gradient: it teaches nothing")
+    if done[..., 0, :].numel() > 1 and bool(done[..., 0, :].all()):
+        traps = ["all episodes end in their first step: look at the start, is_crash and is_success"]
     audit.traps = traps
     return audit
 

@@ -219,7 +219,26 @@ def check_task(env: Task, state: State) -> None:
         is_right = isinstance(x, Tensor) and x.shape == (n, columns or x.shape[-1:].numel())
         wanted = f"({n}, {columns or 'k'})" + ("" if dtype is None else f", {dtype}")
         hint = " Sum a vector over its components: .sum(-1, keepdim=True)." if method.startswith("reward") else ""
+        hint = " Convert it: .to(self.dtype)." if is_right and dtype == env.dtype else hint
         check(is_right and dtype in (None, x.dtype), f"{method} must be a tensor {wanted}; got {kind(x)}.{hint}")
+
+    def call(name: str, *states: State) -> Any:
+        """What a method returns of states, into which it must not write: the physics goes on from them."""
+        before = [(key, x, x._version) for given in states for key, x in given.items()]
+        try:
+            found = getattr(env, name)(*map(dict, states))
+        except KeyError as error:
+            raise UserValueError(
+                f"{task}.{name} asks for {error}, which is no entry of the state or of weights. The state has: "
+                f"{', '.join(map(str, states[0]))}."
+            ) from error
+        for key, x, version in before:
+            check(
+                x._version == version,
+                f"{name} writes into {key!r} in place, which changes the flight itself. Write x = x.clone() first, or "
+                "use torch.where.",
+            )
+        return found
 
     def named(method: str, entries: Any) -> Iterator[tuple[str, Any]]:
         is_mapping = isinstance(entries, Mapping)
@@ -245,8 +264,8 @@ def check_task(env: Task, state: State) -> None:
             shape = (n, *one.shape[-env.nominal.dim(key[1]) :])
             fits = x.shape == shape or key[1] == "motor_time_constant"  # which may be two
             check(fits, f"initial_state: entry {key!r} must have shape {shape}, got {tuple(x.shape)}.")
-    check_tensor("observe(state)", env.observe(state), env.dtype, None)
-    terms, metrics, events = env.reward_terms(state), env.metrics(state), env.events(state, state)
+    check_tensor("observe(state)", call("observe", state), env.dtype, None)
+    terms, metrics, events = call("reward_terms", state), call("metrics", state), call("events", state, state)
     for method, term in named("reward_terms(state)", terms):
         check_tensor(method, term, env.dtype)
     for (method, event), name in zip(named("events(previous, state)", events), events, strict=True):
@@ -260,13 +279,13 @@ def check_task(env: Task, state: State) -> None:
         is_term = event.term is None or event.term in terms
         check(is_term, f"{method}.term must be one of {', '.join(terms)}, or None; got {event.term!r}.")
     for method, metric in named("metrics(state)", metrics):
-        check_tensor(method, metric, None)
+        check_tensor(method, metric, env.dtype)
     missing = sorted(env.metric_info.keys() - EPISODE_METRICS.keys() - metrics.keys())
     adds_some = type(env).episode_metrics is not Task.episode_metrics  # which may give what metrics() lacks
     check(adds_some or not missing, f"metrics(state) lacks {', '.join(missing)}, which metric_info describes.")
     for method in ("is_crash", "is_success"):
-        check_tensor(f"{method}(state)", getattr(env, method)(state), torch.bool)
-    advanced = env.advance(state, dict(state))
+        check_tensor(f"{method}(state)", call(method, state), torch.bool)
+    advanced = call("advance", state, state)
     named("advance(previous, state)", advanced)
     for key in env.task_entries:
         got, wanted = kind(advanced.get(key)), kind(state[key])

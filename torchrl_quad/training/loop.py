@@ -223,6 +223,11 @@ class Run:
             optimizer.step()
             return True
         self.skipped += 1
+        if self.skipped == 1 and rank() == 0:
+            why = f"loss {value:g} and gradient norm {norm:g} are not both finite"
+            torchrl_logger.warning(
+                f"An update was skipped in iteration {self.iteration}: {why}. grad/skipped counts them."
+            )
         parameters = self.loss.named_parameters()
         broken = [key for key, p in parameters if p.grad is not None and not p.grad.isfinite().all()]
         optimizer.zero_grad()

@@ -6,14 +6,15 @@ python recipes/adapt.py checkpoint=outputs/.../checkpoint.pt 'logs=[flight1.csv]
 from pathlib import Path
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from torchrl_quad.adaptation import Adapter, write_report
-from torchrl_quad.deploy import export_policy
+from torchrl_quad.deploy import export_policy, frames
 from torchrl_quad.deploy.contract import sha256
 from torchrl_quad.dynamics import MotorCommand
 from torchrl_quad.files import replacing_folder
-from torchrl_quad.training.building import build_env, read_logs
+from torchrl_quad.identification import read_log
+from torchrl_quad.training.building import build_env
 from torchrl_quad.training.checkpoints import read_checkpoint, write_checkpoint
 from torchrl_quad.training.evaluation import load_policy
 from torchrl_quad.training.launch import recipe
@@ -24,7 +25,10 @@ def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     checkpoint = Path(cfg.checkpoint)
     trained, actor, normalizer = load_policy(checkpoint, trust=cfg.trust)
-    logs = read_logs(cfg)
+    settings = OmegaConf.to_container(cfg)
+    convention = settings["convention"] and frames.named(settings["convention"])
+    reading = {"convention": convention, **(settings["reading"] or {})}
+    logs = [read_log(path, settings["columns"], **reading) for path in cfg.logs]
     motors = None if cfg.motor_command is None else MotorCommand(**cfg.motor_command)
     place = Path(cfg.folder or checkpoint.parent / "adapted")
     with replacing_folder(place, report_only) as folder:

@@ -6,9 +6,9 @@ python recipes/identify.py 'logs=[flight1.csv, flight2.csv]' drone=crazyflie mas
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_quad.deploy import frames
 from torchrl_quad.files import make_folder
-from torchrl_quad.identification import identify
-from torchrl_quad.training.building import read_logs
+from torchrl_quad.identification import identify, read_log
 from torchrl_quad.training.launch import recipe
 
 
@@ -16,7 +16,9 @@ from torchrl_quad.training.launch import recipe
 def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     settings = OmegaConf.to_container(cfg)
-    logs = read_logs(cfg)
+    convention = settings["convention"] and frames.named(settings["convention"])
+    reading = {"convention": convention, **(settings["reading"] or {})}
+    logs = [read_log(path, settings["columns"], **reading) for path in cfg.logs]
     for log in logs:
         print(log)
     known = dict(settings["known"] or {}) | ({} if cfg.mass is None else {"mass": cfg.mass})

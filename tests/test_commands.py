@@ -25,7 +25,7 @@ SMOKE = {  # the tests that run a program on a reduced budget
     "recipes/adapt.py": "test_adaptation",
     "recipes/export.py": "test_deploy_faults",
     "recipes/identify.py": "test_identification",
-    "recipes/import_drone.py": "test_drones",
+    "recipes/import_drone.py": "test_importing",
     "recipes/transfer.py": "test_transfer",
     "benchmarks/paper/reproduce.py": "test_reproduce",
     "benchmarks/paper/results.py": "test_claims",

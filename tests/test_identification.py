@@ -15,6 +15,7 @@ from small_runs import ROOT
 
 from benchmarks import identification as benchmark
 from torchrl_quad import HoveringEnv, load_drone
+from torchrl_quad.deploy import frames
 from torchrl_quad.dynamics import MotorCommand
 from torchrl_quad.errors import UserError
 from torchrl_quad.identification import NoFlight, TooShort, estimation, fitting, identify, prediction, read_log
@@ -293,6 +294,8 @@ def test_the_recipe_fits_a_real_flight_and_draws_it(launch, refused, tmp_path):
     names = "checkpoint.json drone.yaml prediction.png randomization.yaml report.json residuals.png"
     assert sorted(path.name for path in (tmp_path / "fit").iterdir()) == names.split()
     assert refused("identify", "logs=[none.csv]").startswith("Error: none.csv")
+    assert frames.named({"name": "px4", "xyzw": True}).xyzw and frames.named("mujoco") == frames.mujoco()
+    assert "convention" in refused("identify", f"logs=[{REAL}]", "convention={xyzw: true}")
     assert "mass=-1: it must be greater than 0" in refused("identify", f"logs=[{REAL}]", "mass=-1")
 
 

@@ -159,7 +159,7 @@ def test_the_example_of_a_loss_is_short_and_runs(loss):
     (ABPTLoss, {"n_step_return": False, "zero_step_return": False}, "with both off there is no objective"),
     (ABPTLoss, {"n_step_return": "abc"}, "n_step_return must be true or false, got 'abc'. Whether J includes J_N"),
     (ABPTLoss, {"num_qvalue_nets": 0}, "num_qvalue_nets must be at least 1, got 0. The critics made from it"),
-    (ABPTLoss, {"simulated_steps": -1}, "simulated_steps must be at least 0, got -1. Control steps"),
+    (ABPTLoss, {"simulated_steps": -1}, "simulated_steps must be at least 0, got -1. Simulated control steps"),
     (SAPOLoss, {"alpha": 0.0}, "alpha must be greater than 0 or be 'auto', got 0.0. .* without .* take SHACLoss"),
     (SAPOLoss, {"target_entropy": 1.0}, "must be at most -0.001 or be 'auto', got 1.0. .* a negative number"),
     (SAPOLoss, {"num_value_nets": 0}, "num_value_nets must be at least 1, got 0"),

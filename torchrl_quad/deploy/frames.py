@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -160,6 +161,13 @@ class Convention:
 
 
 _SIZES = {"position": 3, "velocity": 3, "quaternion": 4, "angular_velocity": 3, "body_rate": 3, "motors": 4}
+
+
+def named(convention: str | Mapping[str, Any]) -> Convention:
+    """A convention by its name, or by {"name": "px4", "xyzw": True}."""
+    name, xyzw = (convention, None) if isinstance(convention, str) else (convention["name"], convention.get("xyzw"))
+    made = globals()[name]()
+    return made if xyzw is None else replace(made, xyzw=xyzw)
 
 
 def px4(world: str = "enu") -> Convention:

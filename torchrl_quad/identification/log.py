@@ -92,7 +92,7 @@ class FlightLog:
 @checked
 def read_log(
     path: str | Path,
-    columns: str | Layout | Mapping[str, str | Sequence[str] | Columns | None] | None = None,
+    columns: str | Layout | Mapping[str, str | Sequence[str] | Columns | Mapping[str, Any] | None] | None = None,
     *,
     convention: Convention | None = None,
     onboard: Sequence[str] | None = None,
@@ -111,6 +111,7 @@ def read_log(
             :class:`Layout`, or a mapping from quantities to names or :class:`Columns`, in the order of the convention.
             By default the kind of file and the header decide. A mapping replaces entries of the preset for the file,
             and None leaves one out; it describes all of a CSV file, if it names position, attitude and motors.
+            ``{"names": [...], "scale": 1e-3}`` is short for Columns.
         convention: the frames and orders of the file, of :mod:`torchrl_quad.deploy.frames`; by default the preset's,
             and for a mapping of a CSV file ours. Its ``xyzw`` and ``motors`` say how quaternions and motors are named.
         onboard: fields that another clock than the position's has stamped; "setpoint" is one.

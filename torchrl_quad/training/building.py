@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar, cast
@@ -20,10 +19,8 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_quad import ObservationNormalizer, QuadrotorEnv, TrustRegion, make_actor, make_env, make_visual_actor
 from torchrl_quad.data.unwrap import base_env, leaf, observed
-from torchrl_quad.deploy import frames
 from torchrl_quad.envs.registry import imported
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.identification import FlightLog, read_log
 from torchrl_quad.objectives import PathwiseLoss, SHACLoss
 from torchrl_quad.options import argument_names
 from torchrl_quad.training.configuration import own_disturbances, plain
@@ -307,12 +304,3 @@ def shuffled(rollout: TensorDictBase, batch_size: int, epochs: int) -> Iterator[
     for _ in range(epochs):
         mixed = cast("TensorDict", steps[torch.randperm(len(steps), device=steps.device)])
         yield from mixed.split(size)
-
-
-def read_logs(cfg: DictConfig) -> list[FlightLog]:
-    """The logs that a recipe names, by its columns and its convention, such as px4 or {name: px4, xyzw: true}."""
-    values = plain(cfg)
-    about = {"name": x} if isinstance(x := values["convention"], str) else dict(x or {})
-    convention = dataclasses.replace(getattr(frames, about.pop("name"))(), **about) if about else None
-    options: dict[str, Any] = {"convention": convention, **(values.get("reading") or {})}
-    return [read_log(path, values["columns"], **options) for path in values["logs"]]

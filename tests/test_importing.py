@@ -248,10 +248,12 @@ def test_rotors_are_found_by_their_names_and_axes_and_what_follows_from_a_given_
     (tmp_path / "x.urdf").write_text(guarded)
     wanted = load_drone(tmp_path / "x.urdf", torch.float64, motor_time_constant=0.05)
     assert "of motor0_link, motor1_link" in import_drone(tmp_path / "x.urdf", motor_time_constant=0.05)
-    for names in ("front_left front_right back_left back_right", "/m1 /m2 /m3 /m4"):  # as other projects write them
+    own = ["motor_{}/link", "x::motor_{}::link", "quadrotor/motor_{}", "quadrotor/m{}_prop"]  # as other projects write
+    sides = ["front_left_prop", "front_right_prop", "back_left_prop", "back_right_prop"]
+    for names in (sides, *([form.format(i) for i in range(4)] for form in own)):
         renamed = flat
-        for i, name in enumerate(names.split()):
-            renamed = renamed.replace(f"motor{i}_link", f"quadrotor{name}_prop" if "/" in name else f"{name}_prop")
+        for i, name in enumerate(names):
+            renamed = renamed.replace(f"motor{i}_link", name)
         (tmp_path / "z.urdf").write_text(renamed)
         named = load_drone(tmp_path / "z.urdf", torch.float64, motor_time_constant=0.05)
         torch.testing.assert_close(named.rotor_positions, wanted.rotor_positions)
@@ -265,13 +267,6 @@ def test_rotors_are_found_by_their_names_and_axes_and_what_follows_from_a_given_
     besides += "<joint name='m' type='fixed'><parent link='arm'/><child link='motor0_link'/></joint>"
     (tmp_path / "z.urdf").write_text(flat.replace("</robot>", besides + "</robot>"))
     assert len(load_drone(tmp_path / "z.urdf", torch.float64, motor_time_constant=0.05).rotor_positions) == 4
-    for form in ("motor_{}/link", "x::motor_{}::link", "quadrotor/motor_{}"):
-        renamed = flat
-        for i in range(4):
-            renamed = renamed.replace(f"motor{i}_link", form.format(i))
-        (tmp_path / "z.urdf").write_text(renamed)
-        named = load_drone(tmp_path / "z.urdf", torch.float64, motor_time_constant=0.05)
-        torch.testing.assert_close(named.rotor_positions, wanted.rotor_positions)
     lying = flat.replace("<origin xyz='0.2 -0.1 0'", "<origin xyz='0.2 0 0.1'").replace("</robot>", turned + "</robot>")
     (tmp_path / "y.URDF").write_text(lying)
     upright = load_drone(tmp_path / "y.URDF", torch.float64, motor_time_constant=0.05)

@@ -399,7 +399,8 @@ def test_tables_of_other_separators_and_headers_that_begin_as_comments_are_read(
         "\n".join(["#" + head.replace(",", "\t"), *(x.replace(",", "\t") for x in rows)]),
         "\n".join(["% " + head.replace(",", " "), *(x.replace(",", "  ") for x in rows)]),  # as numpy.savetxt writes
         "\n".join([head.replace(",", ";"), *(x.replace(",", ";").replace(".", ",") for x in rows)]),
-        "\n".join(["# a remark", "%mode," + head, *(f"MANUAL,{x}" for x in rows)]),  # as rostopic writes
+        "\n".join(["# a remark", head, *rows]),
+        "\n".join(["%mode," + head, *(f"MANUAL,{x}" for x in rows)]),  # as rostopic writes
     ):
         path.write_text(text)
         np.testing.assert_array_equal(read_log(path, TABLE).position, plain.position)
@@ -440,8 +441,7 @@ def test_a_clock_that_jumps_ahead_is_refused_before_it_is_put_on_a_grid(tmp_path
 
 def test_values_beyond_any_flight_count_as_missing_and_wide_tables_are_read(tmp_path):
     t = times(100)
-    columns = own_table(t) | {"x": np.where(np.arange(len(t)) == 500, 1e38, own_table(t)["x"])}
-    path = write_csv(tmp_path / "a.csv", columns)
+    path = write_csv(tmp_path / "a.csv", own_table(t) | {"x": np.where(t == t[500], 1e38, own_table(t)["x"])})
     log = read_log(path, TABLE)
     assert np.abs(log.position).max() < 10.0 and "beyond 1e+09" in str(log)
     head, *rows = path.read_text().splitlines()

@@ -140,7 +140,6 @@ def audit_reward(
     for name, term in terms.items():
         if term.shape != shape:
             raise UserValueError(f"The term {name!r} has shape {tuple(term.shape)}, and the reward {shape}.")
-    for name, term in terms.items():
         if broken := int((~term.isfinite()).sum()):
             raise UserValueError(
                 f"The term {name!r} is not finite in {broken} of {term.numel()} steps. Look for a logarithm, a root or "

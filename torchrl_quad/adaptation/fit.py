@@ -155,42 +155,17 @@ def fit_flight(logs: Sequence[FlightLog], drone: QuadrotorParams, motors: MotorC
         if not wide:
             break
         open_ = {name: group for name, group in open_.items() if name not in wide}
-    kept = [errors(nothing)[held], errors(x)[held]]
-
-    def misses(e: Tensor, scale: Tensor) -> float:  # errors below those of a good fit say nothing
-        return float((e / scale).square().clamp_max(100.0).mean().clamp_min(1.0))
-
     if len(logs) > 1 and free:
-        own = [windows.log == k for k in range(len(logs))]
-        alone = [_solve(errors, free, ~held & rows) for rows in own]
-        apart = torch.stack([y for y, _, _ in alone])
-        apart, wide = (apart - apart.mean(0)).abs(), torch.stack([5.0 * c.diag().sqrt() for _, c, _ in alone])
-        for k, (log, rows, (_, _, usual)) in enumerate(zip(logs, own, alone, strict=True)):
-            without, together = (misses(errors(y)[held & rows], usual) for y in (nothing, x))
-            if (apart[k] > torch.maximum(0.5 * _APART, wide[k])).any() or together > WORSE * without:
-                raise NotOneDrone(
-                    f"{log.name} does not agree with the others: by itself it shows another drone or wind. Give "
-                    "flights of one drone in one wind, or each by itself."
-                )
-    squares = [misses(e, scale) for e in kept]
+        _check_agreement(logs, [windows.log == k for k in range(len(logs))], errors, x, free, held)
+    kept = [errors(nothing)[held], errors(x)[held]]
+    squares = [_misses(e, scale) for e in kept]
     rms = [
         {"acceleration": float(e[:, :3].square().sum(1).mean().sqrt()),
          "angular_acceleration": float(e[:, 3:].square().sum(1).mean().sqrt())}
         for e in kept
     ]  # fmt: skip
-    common = dataclasses.replace(fit, mean=x).thrust
-    if "rotors" in open_ and not COMMON[0] < common < COMMON[1]:
-        raise NotOneDrone(
-            f"all rotors together would give {common:.2f} of the thrust of the simulator's drone. Check its mass and "
-            "thrust map, and what a motor command means (motor_command, the battery): no fit tells these apart."
-        )
-    if "rotors" in open_ and (left := float(kept[1][:, :3].norm(dim=1).median())) > LARGEST:
-        raise NotOneDrone(
-            f"the fit still misses the acceleration by {left:.2g} m/s2. Check the drone, the units "
-            "of the log, and what a motor command means (motor_command)."
-        )
     values, vectors = torch.linalg.eigh(cover)
-    return dataclasses.replace(
+    found = dataclasses.replace(
         fit,
         mean=x,
         root=vectors * values.clamp_min(0.0).sqrt(),
@@ -199,6 +174,44 @@ def fit_flight(logs: Sequence[FlightLog], drone: QuadrotorParams, motors: MotorC
         after=rms[1],
         gain=1.0 - squares[1] / squares[0],
     )
+    if "rotors" in open_ and not COMMON[0] < found.thrust < COMMON[1]:
+        raise NotOneDrone(
+            f"all rotors together would give {found.thrust:.2f} of the thrust of the simulator's drone. Check its mass "
+            "and thrust map, and what a motor command means (motor_command, the battery): no fit tells these apart."
+        )
+    if "rotors" in open_ and (left := float(kept[1][:, :3].norm(dim=1).median())) > LARGEST:
+        raise NotOneDrone(
+            f"the fit still misses the acceleration by {left:.2g} m/s2. Check the drone, the units "
+            "of the log, and what a motor command means (motor_command)."
+        )
+    return found
+
+
+def _check_agreement(
+    logs: Sequence[FlightLog],
+    rows: Sequence[Tensor],
+    errors: Callable[[Tensor], Tensor],
+    x: Tensor,
+    free: list[int],
+    held: Tensor,
+) -> None:
+    """Refuse flights of which one, by itself, shows another drone or wind than the fit x to all of them."""
+    alone = [_solve(errors, free, ~held & own) for own in rows]
+    apart = torch.stack([y for y, _, _ in alone])
+    apart = (apart - apart.mean(0)).abs()
+    before, after = errors(torch.zeros_like(x)), errors(x)
+    for log, own, far, (_, cover, usual) in zip(logs, rows, apart, alone, strict=True):
+        without, together = (_misses(e[held & own], usual) for e in (before, after))
+        if (far > torch.maximum(0.5 * _APART, 5.0 * cover.diag().sqrt())).any() or together > WORSE * without:
+            raise NotOneDrone(
+                f"{log.name} does not agree with the others: by itself it shows another drone or wind. Give "
+                "flights of one drone in one wind, or each by itself."
+            )
+
+
+def _misses(e: Tensor, scale: Tensor) -> float:
+    """The mean square of errors (W, 6) in units of their usual size; below those of a good fit they say nothing."""
+    return float((e / scale).square().clamp_max(100.0).mean().clamp_min(1.0))
 
 
 def _solve(errors: Callable[[Tensor], Tensor], free: list[int], train: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -213,12 +213,7 @@ def _drone_models(said: Said) -> Found:
     lag = "rotor_tau" if "rotor_tau" in said.data else "thrust_tau"
     found = said.fields(mass="mass", yaw_torque_coefficient="thrust2torque", motor_time_constant=lag)
     found |= diagonal(said("J", 3, 3))
-    arm, mix, gravity, drag = (
-        said("L"),
-        said("mixing_matrix", 3, None),
-        said("gravity_vec", 3),
-        said("drag_matrix", 3, 3),
-    )
+    arm, mix, gravity = said("L"), said("mixing_matrix", 3, None), said("gravity_vec", 3)
     force, torque = said("rpm2thrust", 3), said("rpm2torque", 3)
     curve = None if force is None else force[::-1] / [RPM**2, RPM, 1.0]
     found["thrust_map"] = curve, ""
@@ -232,7 +227,7 @@ def _drone_models(said: Said) -> Found:
         if newton is not None and curve is not None:
             found[end] = speed_at(newton, curve), f"at {newton:g} N"
     mass = found["mass"][0]
-    if drag is not None:
+    if (drag := said("drag_matrix", 3, 3)) is not None:
         found.setdefault("linear_drag", (np.abs(np.diag(drag)), "drag_matrix"))
     if curve is None or mass is None or mix is None:
         return found

@@ -57,8 +57,8 @@ def read_xml(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
     motors = sorted(
         (x for x in plugins if x.find("motorConstant") is not None), key=lambda x: _digits(x.findtext("motorNumber"))
     )
-    short = {re.split("/|::", name)[-1]: name for name in links}
-    rotors = [short.get(re.split("/|::", (x.findtext("linkName") or "").strip())[-1], "") for x in motors]
+    short = {_last(name): name for name in links}
+    rotors = [short.get(_last(x.findtext("linkName")), "") for x in motors]
     plain = {x: re.sub("(quad|hexa|octo|multi)_?rotor", "", x.lower()) for x in links}
     for name, word in itertools.product((_NUMBERED, _PLACED), ("rotor", "prop", "motor")):
         named = [x for x, said in plain.items() if re.search(name.format(word), said) and "guard" not in said]
@@ -66,8 +66,8 @@ def read_xml(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
     if "" in rotors:
         raise UserValueError(f"{path}: the linkName of a motor is that of no link with an <inertial>. Add it.")
     lifts = [x for x in plugins if "liftdrag" in re.sub(r"\W|_", "", x.get("filename", "").lower())]
-    blades = {re.split("/|::", x)[-1] for x in rotors}
-    if any(re.split("/|::", (x.findtext("link_name") or "").strip())[-1] not in blades for x in lifts):
+    blades = {*map(_last, rotors)}
+    if any(_last(x.findtext("link_name")) not in blades for x in lifts):
         raise UserValueError(f"{path}: it has wings (LiftDrag), and a drone here has rotors alone. Take a multicopter.")
     _check_fixed(drone, blades, path)
     found = _body(links, rotors, bool(motors)) | given
@@ -85,8 +85,7 @@ def _check_fixed(drone: ET.Element, rotors: set[str], path: Path) -> None:
     joints = {}
     for joint in drone.iter("joint"):
         ends = [joint.find(name) for name in ("parent", "child")]
-        names = ["" if x is None else x.get("link") or x.text or "" for x in ends]
-        parent, child = (re.split("/|::", name.strip())[-1] for name in names)
+        parent, child = ("" if x is None else _last(x.get("link") or x.text) for x in ends)
         if parent and child:
             joints[child] = parent, joint
     for rotor in rotors:
@@ -98,6 +97,11 @@ def _check_fixed(drone: ET.Element, rotors: set[str], path: Path) -> None:
             if joint is not None and joint.get("type") in _TURNING and len(limits) != 1:
                 why = f"the joint {shown(joint.get('name'))} turns the rotor {shown(rotor)}"
                 raise UserValueError(f"{path}: {why}, and rotors here are fixed to the body. Take another drone.")
+
+
+def _last(name: str | None) -> str:
+    """A name without those of the models around it."""
+    return re.split("/|::", (name or "").strip())[-1]
 
 
 def _digits(name: str | None) -> list[int]:

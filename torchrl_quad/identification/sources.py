@@ -46,9 +46,9 @@ def read_streams(path: Path, columns: Asked) -> Read:
     """The streams of a file, what is where in it, and notes. Its first bytes tell the kind of file."""
     if not path.exists():
         raise UnreadableLog(f"{path} does not exist. Give the path of a log.")
-    if path.is_dir() and not any(x.suffix in (".db3", ".mcap", ".zstd") for x in path.iterdir()):
-        raise UnreadableLog(f"{path} is a folder without a ROS bag. Give the path of the log in it.")
     if path.is_dir():
+        if not any(x.suffix in (".db3", ".mcap", ".zstd") for x in path.iterdir()):
+            raise UnreadableLog(f"{path} is a folder without a ROS bag. Give the path of the log in it.")
         return read_bag(path, columns)
     with open_plain(path) as file:
         start = file.peek(16)[:16]

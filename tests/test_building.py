@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from omegaconf import OmegaConf
-from refusals import cases
+from refusals import cases, refuses
 from small_runs import assert_equal
 from tensordict import TensorDict
 from torch import nn
@@ -16,6 +16,7 @@ from torchrl.objectives import SoftUpdate
 from torchrl.trainers import DefaultOptimizationStepper, Trainer, UpdateWeights
 
 from torchrl_quad import DifferentiableCollector, HoveringEnv, differentiable_rollout
+from torchrl_quad.envs.disturbances import Disturbance
 from torchrl_quad.modules import make_actor, make_qvalue, make_value
 from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, SHACLoss
 from torchrl_quad.training import building
@@ -27,6 +28,7 @@ from torchrl_quad.training.building import (
     minibatches,
     shuffled,
 )
+from torchrl_quad.training.configuration import compose
 from torchrl_quad.training.evaluation import (
     has_levelled_off,
     has_lost_its_way,
@@ -80,6 +82,49 @@ def test_a_critic_of_a_recipe_reads_what_its_policy_does_not_see(kind, make, sca
     rollout["next", "state", "rotor_speed"] = 0.5 * rollout["next", "state", "rotor_speed"]
     assert loss(rollout)["loss_actor"] != before["loss_actor"]
     assert ("state", "rotor_speed") in loss.in_keys and ("state", "rotor_speed") not in actor.in_keys
+
+
+class Known(Disturbance):
+    """Lets critics know the rotor speeds."""
+
+    privileged = {"rotor_speed": 1e-3}
+
+
+class Blind(HoveringEnv):
+    """Lets only critics know where the drone is."""
+
+    privileged = {"position": 0.5}
+
+    def observe(self, state):
+        return state["velocity"]
+
+
+@cases(
+    (["env.disturbances=[test_building.Known]"], {("state", "rotor_speed"): 1e-3}),
+    (["task=test_building.Blind"], {("state", "position"): 0.5}),
+    (
+        ["env.randomize=any", "env.control=rotor_thrusts", "env.drone=cf2x"],
+        {("state", "traits"): 1.0, ("state", "rotor_speed"): 1e-3},
+    ),
+    (["env.drone=cf2x"], {}),
+)
+def test_critics_read_what_a_task_or_a_disturbance_keeps_from_policies_which_then_have_a_memory(words, read):
+    cfg = compose("train", ["task=hovering", "compile=false", "num_envs=2", *words])
+    env, actor = building.set_up(cfg)
+    critic = make_value(env, **building.network(cfg, "critic", env))
+    assert critic.in_keys == ["observation", *read] and critic.module.scales == (1.0, *read.values())
+    assert ("recurrent_state" in actor.in_keys) == bool(read)
+    assert (
+        "recurrent_state" not in building.make_policy(compose("train", [*words, "actor.recurrent=false"]), env).in_keys
+    )
+
+
+@cases(("mass", 1.0), ("position", "large"), ("position", None))
+def test_what_critics_are_to_read_must_be_in_the_state(key, factor):
+    class Wrong(HoveringEnv):
+        privileged = {key: factor}
+
+    refuses(rf"Wrong.privileged must be entries of the state, .* got '{key}': {factor!r}. The state has: ", Wrong)
 
 
 @cases(("constant", 1e-2, 1e-2), ("linear", 5.05e-3, 1e-4), ("exponential", 1e-3, 1e-4), ("cosine", 5.05e-3, 1e-4))

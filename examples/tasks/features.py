@@ -17,6 +17,7 @@ class Features(HoveringEnv):
         "observe_last_action": True,
         "random_start": {"tilt": 0.5, "yaw": 0.3, "velocity": 1.0, "angular_velocity": 1.0},
     }
+    privileged = dict.fromkeys(("position", "quaternion", "velocity", "angular_velocity"), 1.0)
     target, start_range = (0.0, 0.0, 1.5), (0.5, 0.5, 0.5)
     sides = ((-1, 0.7), (-1, 2.3), (0, 0.5), (0, 1.5), (0, 2.5), (1, 0.7), (1, 2.3))  # y and z [m], at x = 3 m
 

@@ -76,6 +76,8 @@ class AnyDrone(DroneRandomization):
     ``drag_up``, and the delay.
     """
 
+    privileged = {"traits": 1.0, "rotor_speed": 1e-3}
+
     def __init__(self, spec: str | Path | Mapping, layout: QuadrotorParams) -> None:
         source, spec = ("randomize", {"any": {}}) if spec == "any" else presets.read("randomize", spec)
         given = spec["any"] or {}

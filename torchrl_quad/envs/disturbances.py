@@ -40,6 +40,8 @@ class Disturbance:
     ``("drone", "rotor_effectiveness")`` of 0 is a dead rotor. ``wind`` changes the air it flies in.
     """
 
+    privileged: Mapping[str | tuple[str, str], float] = {}  #: as of a task
+
     @property
     def noise_size(self) -> int:
         """How many standard normal numbers each environment needs for ``advance``; a plain class attribute will do."""

@@ -68,6 +68,9 @@ class Task(abc.ABC):
     weights: Mapping[str, Any] = {}  #: of the reward's terms; an argument of the same name overrides some
     ends_on_success = False  #: whether success terminates the episode, too
     metric_info: Mapping[str, Metric] = EPISODE_METRICS  #: how each metric is summed up, printed and drawn, by name
+    #: Entries of the state, such as "position", that only critics know, with factors that bring them to about one. In
+    #: recipes the critics read them beside the observation, and the policy gets a memory.
+    privileged: Mapping[Key, float] = {}
 
     @abc.abstractmethod
     def initial_state(self, n: int) -> State:
@@ -283,6 +286,10 @@ def check_task(env: Task, state: State) -> None:
     missing = sorted(env.metric_info.keys() - EPISODE_METRICS.keys() - metrics.keys())
     adds_some = type(env).episode_metrics is not Task.episode_metrics  # which may give what metrics() lacks
     check(adds_some or not missing, f"metrics(state) lacks {', '.join(missing)}, which metric_info describes.")
+    for key, factor in ((key, x) for each in (env, *env.disturbances.values()) for key, x in each.privileged.items()):
+        is_right = isinstance(factor, numbers.Real) and key in state and state[key].dim() == 2
+        hint = "must be entries of the state, (n, k), each with a factor, such as {'position': 1.0}"
+        check(is_right, f"privileged {hint}; got {key!r}: {factor!r}. The state has: {', '.join(map(str, state))}.")
     for method in ("is_crash", "is_success"):
         check_tensor(f"{method}(state)", call(method, state), torch.bool)
     advanced = call("advance", state, state)

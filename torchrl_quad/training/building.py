@@ -9,7 +9,7 @@ from typing import Any, TypeVar, cast
 import torch
 import torch.distributed as dist
 from omegaconf import DictConfig, OmegaConf
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
@@ -101,7 +101,8 @@ def make_policy(cfg: DictConfig, env: EnvBase) -> TensorDictModule:
     log_prob = "entropy_bonus" in cfg.loss or cfg.loss.get("alpha", 0) != 0  # of PPO, or of an entropy bonus
     options = network(cfg, "actor") | {x: cfg.actor[x] for x in ("scale_init", "noise_correlation", "learn_scale")}
     sees = cfg.actor.vision and "depth" in observed(env)
-    options |= {"recurrent": sees if cfg.actor.recurrent is None else cfg.actor.recurrent}
+    remembers = sees or bool(privileged(env))
+    options |= {"recurrent": remembers if cfg.actor.recurrent is None else cfg.actor.recurrent}
     options |= {"hidden_size": cfg.actor.hidden_size, "return_log_prob": log_prob}
     if not sees:
         return make_actor(env, **options)
@@ -118,9 +119,18 @@ def network(cfg: DictConfig, name: str, env: EnvBase | None = None) -> dict[str,
         keys = [key if isinstance(key, str) else tuple(key) for key in section.in_keys]
         scale = section.input_scale  # one, or one for each entry
         return options | {"in_keys": keys, "input_scale": plain(scale) if OmegaConf.is_list(scale) else scale}
-    if env is not None and "obstacle" in observed(env):  # a critic reads where it is; a policy has images of it
-        options |= {"in_keys": ["observation", "obstacle"], "input_scale": [scale, 1.0]}
+    if env is not None:
+        more = privileged(env) | ({"obstacle": 1.0} if "obstacle" in observed(env) else {})  # of which there are images
+        options |= {"in_keys": ["observation", *more], "input_scale": [scale, *more.values()]}
     return options
+
+
+def privileged(env: EnvBase) -> dict[NestedKey, float]:
+    """What the critics read and the policy does not, with factors, as the task and its disturbances say."""
+    task: Any = base_env(env)
+    sources = (task, *getattr(task, "disturbances", {}).values())
+    said = [x for source in sources for x in getattr(source, "privileged", {}).items()]
+    return {("state", *([key] if isinstance(key, str) else key)): factor for key, factor in said}
 
 
 def make_loss(

@@ -179,7 +179,7 @@ IDLE: list[tuple[str, Callable[[Any], bool], str]] = [
     ("actor.hidden_size", lambda c: c["actor"]["recurrent"] is False, "actor.recurrent=false"),
     (
         "actor.hidden_size",
-        lambda c: c["actor"]["recurrent"] is None and not (c["env"].get("camera") and c["actor"]["vision"]),
+        lambda c: c["actor"]["recurrent"] is None and not _may_remember(c),
         "a policy that sees nothing has a memory only with actor.recurrent=true",
     ),
     ("loss.alpha_init loss.target_entropy", lambda c: c["loss"].get("alpha") != "auto", "loss.alpha is not auto"),
@@ -193,6 +193,14 @@ IDLE: list[tuple[str, Callable[[Any], bool], str]] = [
     ("logger.project logger.group logger.mode", lambda c: c["logger"]["backend"] != "wandb", "it is wandb's"),
     ("restart_fraction", lambda c: c.get("buffer", {}).get("fraction") is not None, "buffer.fraction is set"),
 ]
+
+
+def _may_remember(c: Any) -> bool:
+    """Whether a policy may get a memory without being asked to."""
+    env = c["env"]
+    sees = env.get("camera") and c["actor"]["vision"]
+    told = [task_class(c["task"]), *(env.get("disturbances") or ())]
+    return bool(sees or "any" in (env.get("randomize") or "") or any(getattr(x, "privileged", x) for x in told))
 
 
 def settings(name: str) -> dict[str, Any]:

@@ -222,7 +222,7 @@ def test_a_file_that_is_no_contract_is_refused(tmp_path, text):
 
 
 CHANGES = [  # of a contract whose checksums fit
-    ("version", 3, "has version 3, and this torchrl_quad reads 4 and 5. It was written by torchrl_quad"),
+    ("version", 3, "has version 3, and this torchrl_quad reads 5. It was written by torchrl_quad"),
     ("smell", {}, r"/contract.json: it: .*'smell' was unexpected.* This torchrl_quad cannot fly it. It was written"),
     ("output.thrust.range.1", 1e308, r"output.thrust.range\[1\]: 1e\+308 is greater than the maximum of 600000"),
     ("drone.max_thrust_to_weight", 21, "drone.max_thrust_to_weight: 21 is greater than the maximum of 20"),
@@ -254,25 +254,6 @@ def test_a_contract_that_this_package_does_not_fly_is_refused(copied, path, valu
     part[last] = value
     fit(folder, about)
     refuses(f"^{folder}.*{message}", load_bundle, folder, error=UnknownContract)
-
-
-def test_a_bundle_of_version_4_still_flies(copied):
-    folder, about = copied
-    new = load_bundle(folder)
-    for part, names in {
-        "output": ("control", "units", "range", "law", "gains"),
-        "task": ("documentation", "constants"),
-    }.items():
-        for name in names:
-            del about[part][name]
-    del about["obstacles"], about["rate_loop"]["torque"]
-    fit(folder, about | {"version": 4})
-    old = load_bundle(folder)
-    assert old.check() <= 1e-5 and old.contract["output"]["control"] == "rates"
-    np.testing.assert_allclose(np.hstack(old(resting())), np.hstack(new(resting())), rtol=1e-6)
-    del about["output"]["thrust"]
-    fit(folder, about | {"version": 4})
-    refuses("contract.json: version: 5 was expected", load_bundle, folder)
 
 
 def test_the_ranges_of_the_schema_lie_within_those_of_the_simulated_drones():

@@ -244,8 +244,13 @@ def test_what_contradicts_the_drone_is_found_and_no_inertia_is_one_that_no_body_
     short, options = dataclasses.replace(real, segments=((300, 700),)), {"fields": ["linear_drag"], "draws": 0} | BRIEF
     turned = "the other way than the drone's.*Write rotor_spin: .1, -1, 1, -1. in the drone"
     refuses(turned, identify, short, "crazyflie", {"rotor_spin": [-1, 1, -1, 1]}, **options)
-    heavy = r"left over .*mass of 0.06 kg or its thrust.*name \"thrust_map\" in fields"
-    refuses(heavy, identify, short, "crazyflie", {"mass": 0.06}, iterations=1, **options)
+    for fields in (["linear_drag"], ["thrust_map", "linear_drag"]):  # a fitted thrust does not hide it
+        fit = options | {"fields": fields, "iterations": 1}
+        for mass in (0.06, 0.02):
+            message = f"left over .*mass of {mass} kg or its thrust"
+            said = refuses(message, identify, short, "crazyflie", {"mass": mass}, **fit)
+            curve = json.loads(re.search(r'known={"thrust_map": (.*)}', said)[1])
+            identify(short, "crazyflie", {"mass": mass, "thrust_map": curve}, **options | {"iterations": 1})
     large = dataclasses.replace(short, battery_voltage=10.0 * real.battery_voltage)
     refuses("a battery has 3.* V in the mean, and the drone's motor_command is for", identify, large, **options)
     result = identify(short, iterations=1, **options)

@@ -221,6 +221,39 @@ obstacle_pos = {fn = "uniform", kwargs = {minval = [-0.1, -0.1, 0.0], maxval = [
 POINTS = {"initial": {"position": [-5, 4, 1]}, "end": {"position": [4, 0, 1]}, "gate_radius": 0.4}
 
 
+def flight_of_tii(path, laps=2.4, tilt=0.2):
+    """A figure eight through three gates, of which the middle one, tilted back, is passed both ways in each lap."""
+    t = np.linspace(0.3, 0.3 + 2.0 * np.pi * laps, 2000)
+    columns = {"drone_x": 6.0 * np.cos(t), "drone_y": 3.0 * np.sin(2.0 * t), "drone_z": 1.5 + 0.0 * t}
+    back = np.array([-math.sin(tilt), 0.0, math.cos(tilt)])
+    ahead_of = (((6, 0, 1.5), [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]), ((0, 0, 1.5), [0.0, 1.0, 0.0], back))
+    for i, (centre, across, up) in enumerate((*ahead_of, ((-6, 0, 1.5), [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]))):
+        for j, (a, b) in enumerate(((-1, 1), (1, -1), (1, 1), (-1, -1))):
+            corner = np.array(centre) + 0.8 * a * np.array(across) + 0.6 * b * np.array(up)
+            for axis, x in zip("xyz", corner, strict=True):
+                columns[f"gate{i + 1}_marker{j + 1}_{axis}"] = x + 0.01 * np.sin(9.0 * t)
+    lines = [",".join(columns), *(",".join(f"{x:.5f}" for x in row) for row in zip(*columns.values(), strict=True))]
+    lines[5] = "," * (len(columns) - 1)  # nothing is seen
+    path.write_text("\n".join(lines))
+    return path
+
+
+def test_a_flight_of_the_tii_dataset_shows_its_track(tmp_path):
+    track = load_track(flight_of_tii(tmp_path / "flight.csv"))
+    assert track["closed"] and track["notes"][0] == "a lap of 4 gates, flown 2.2 times"
+    gates = track["gates"]
+    np.testing.assert_allclose([x["position"][:2] for x in gates], [[0, 0], [-6, 0], [0, 0], [6, 0]], atol=0.02)
+    np.testing.assert_allclose([(x["width"], x["height"]) for x in gates], [[1.6, 1.2]] * 4, atol=0.02)
+    ways = forward(torch.tensor([gate["rotation"] for gate in gates], dtype=torch.float64)).tolist()
+    tilted = np.array([math.cos(0.2), 0.0, math.sin(0.2)])
+    np.testing.assert_allclose(ways, [-tilted, [0, 1, 0], tilted, [0, 1, 0]], atol=0.02)
+    RacingEnv(num_envs=2, track=str(tmp_path / "flight.csv")).reset()
+    refuses("passed 2 gates, and no lap twice", load_track, flight_of_tii(tmp_path / "short.csv", laps=0.7))
+    (tmp_path / "other.csv").write_text("time,x\n0,1\n")
+    refuses("flight of TII's drone racing dataset, and has no column drone_x", load_track, tmp_path / "other.csv")
+    refuses("No flight at .*none.csv", load_track, str(tmp_path / "none.csv"), error=FileNotFoundError)
+
+
 def test_tracks_of_other_projects_are_read_and_what_was_assumed_is_said(tmp_path):
     (tmp_path / "split.yaml").write_text(SPLIT_S)
     split = load_track(tmp_path / "split.yaml", width=1.5, height=1.2)

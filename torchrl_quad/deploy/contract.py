@@ -113,17 +113,6 @@ def digest(contract: Contract) -> str:
 # -- what the contract says --------------------------------------------------------------------------------------------
 
 
-def upgraded(contract: Contract) -> Contract:
-    """A contract in the words of this version. Those of version 4 all command thrust and body rates."""
-    if contract["version"] != 4:
-        return contract
-    output = contract["output"]
-    range_ = [output["thrust"]["range"], *output["body_rate"]["range"]]
-    own = {"control": "rates", "units": ["N", *3 * ["rad/s"]], "range": range_, "law": "", "gains": {}}
-    task = {"documentation": "", "constants": {}} | contract["task"]
-    return {**contract, "version": VERSION, "task": task, "output": output | own, "obstacles": None}
-
-
 def problem(contract: Contract) -> str | None:
     """Where a contract does not fit its schema, or its drones cannot fly, if anywhere."""
     found = itertools.chain(_misfits(contract), _unequal(contract))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 from pathlib import Path
@@ -21,7 +20,6 @@ from torchrl_quad.deploy.contract import (
     files,
     problem,
     sha256,
-    upgraded,
 )
 from torchrl_quad.errors import MissingPackage, one_line, shown
 
@@ -97,15 +95,11 @@ def read(folder: Path) -> tuple[Contract, dict[str, Graph], Arrays, Arrays]:
         raise TamperedBundle(f"{path} is no contract of a policy, or is damaged: {why}. {AGAIN}") from error
     package = contract.get("origin", {}).get("package", "another version")
     written = f"It was written by {package}: use that one, or export again."
-    if version not in (VERSION - 1, VERSION):
-        raise UnknownContract(
-            f"{path} has version {shown(version)}, and this torchrl_quad reads {VERSION - 1} and {VERSION}. {written}"
-        )
+    if version != VERSION:
+        raise UnknownContract(f"{path} has version {shown(version)}, and this torchrl_quad reads {VERSION}. {written}")
     changed = f"was changed after the export: its checksum does not fit. {AGAIN}"
     if not fits:
         raise TamperedBundle(f"{path} {changed}")
-    with contextlib.suppress(KeyError, TypeError, ValueError):  # what it lacks, the schema names
-        contract = upgraded(contract)
     if said := problem(contract):
         raise UnknownContract(f"{path}: {said}. This torchrl_quad cannot fly it. {written}")
     content = {}

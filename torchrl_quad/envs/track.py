@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchrl_quad.dynamics import presets, quaternion
-from torchrl_quad.envs.track_files import own_format, posed
+from torchrl_quad.envs.track_files import flown_track, own_format, posed
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.options import Seed, accepted, between, build, check_value, checked, entries
 from torchrl_quad.rotations import from_euler
@@ -168,7 +168,8 @@ def load_track(track: str | Path | Mapping = "visfly", **settings: Any) -> dict[
 
     Files of these projects are known by what they hold: uzh-rpg's agile_flight (``position``, ``rotation`` and
     ``scale`` of gates by name) and rpg_time_optimal (points, ``initial`` and ``end``), utiasDSL's lsy_drone_racing
-    (TOML), and the ``track_config`` of isaac_drone_racer (``pos`` and ``yaw`` of gates by name).
+    (TOML), the ``track_config`` of isaac_drone_racer (``pos`` and ``yaw`` of gates by name), and flights of TII's
+    drone racing dataset (CSV).
 
     Args:
         track: the name of one in the package, the path of a YAML or TOML file, or a mapping; one with ``file`` changes
@@ -261,7 +262,8 @@ def _read(track: Any, settings: Mapping[str, Any]) -> tuple[str, dict[str, Any]]
     """What a track says, with the settings that change it, and its name in errors."""
     values, source = dict(settings), "track"
     for _ in range(MAX_FILES):
-        source, said = presets.read("track", track, _TRACKS)
+        is_flight = isinstance(track, str | Path) and str(track).lower().endswith(".csv")
+        source, said = (str(track), flown_track(Path(track))) if is_flight else presets.read("track", track, _TRACKS)
         replaced = {name for key in values for name in _REPLACES.get(key, ())}
         said = {key: x for key, x in said.items() if key not in replaced}
         if replaced.issuperset(_SIZES) and (gates := _rows(said.get("gates"))):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import math
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -179,6 +181,58 @@ def isaac_drone_racer(source: str, values: dict[str, Any], gates: list[Mapping[s
     own = {key: x for key, x in values.items() if key not in ("lift", "gates") and not isinstance(x, Mapping)}
     listed = [{"position": [*gate["pos"][:2], gate["pos"][2] + values["lift"]], "yaw": gate["yaw"]} for gate in gates]
     return {**own, "gates": listed, "notes": ["gates are flown along their x axis, and round after round"]}
+
+
+def flown_track(path: Path) -> dict[str, Any]:
+    """Of TII's drone racing dataset (Bosello et al. 2024, arXiv:2311.02667), from a flight's CSV: it has the inner
+    corners of the gates, and the drone's path shows their order, their directions, and when a lap repeats."""
+    if not path.is_file():
+        raise FileNotFoundError(f"No flight at {path}. Give the path of a ..._500hz_freq_sync.csv that exists.")
+    axes, rows = "xyz", []
+    with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
+        reader = csv.DictReader(file)
+        has = set(reader.fieldnames or ())
+        count = next(k for k in range(100) if f"gate{k + 1}_marker1_x" not in has)
+        corners = [f"gate{i + 1}_marker{j + 1}_{axis}" for i in range(count) for j in range(4) for axis in axes]
+        wanted = [*(f"drone_{axis}" for axis in axes), *corners]
+        if lacking := [name for name in (*wanted, *([] if count else ["gate1_marker1_x"])) if name not in has]:
+            raise UserValueError(
+                f"{path}: a CSV is read as a flight of TII's drone racing dataset, and has no column {lacking[0]}. "
+                "Write your own track in YAML: gates, a list of [x, y, z]."
+            )
+        for row in reader:
+            rows.append([float(row[name] or "nan") for name in wanted])
+    table = np.array(rows).reshape(-1, len(wanted))
+    flown = table[np.isfinite(table[:, :3]).all(1), :3]
+    if len(flown) < 2 or not np.isfinite(table[:, 3:]).any(0).all():
+        raise UserValueError(f"{path}: the drone or a corner of a gate was never seen.")
+    gates, passed = [], []
+    for i, corner in enumerate(np.nanmedian(table[:, 3:], 0).reshape(count, 4, 3)):
+        centre = corner.mean(0)
+        ahead = np.linalg.svd(corner - centre)[2][2]  # what the corners' plane is normal to
+        left = np.cross([0.0, 0.0, 1.0], ahead)
+        left /= np.linalg.norm(left).clip(1e-9)
+        within = np.stack((left, np.cross(ahead, left)), 1)
+        half = np.abs((corner - centre) @ within).mean(0)
+        gates.append({"centre": centre, "ahead": ahead, "size": 2.0 * half})
+        side = (flown - centre) @ ahead
+        for k in np.flatnonzero((side[:-1] < 0.0) != (side[1:] < 0.0)):
+            share = side[k] / (side[k] - side[k + 1])
+            if (np.abs((flown[k] + share * (flown[k + 1] - flown[k]) - centre) @ within) < half).all():
+                passed.append((k + share, i, 1.0 if side[k] < 0.0 else -1.0))
+    order = [x[1:] for x in sorted(passed)]
+    enough = range(2, len(order) - len(order) // 3)  # half a lap, at least, must come again
+    lap = next((k for k in enough if order[k:] == order[:-k]), None)
+    if lap is None:
+        raise UserValueError(f"{path}: the drone passed {len(order)} gates, and no lap twice. Give a longer flight.")
+    found = []
+    for i, sign in order[:lap]:
+        x, y, z = sign * gates[i]["ahead"]
+        width, height = gates[i]["size"].tolist()
+        way = {"yaw": math.atan2(y, x), "pitch": math.asin(z)}
+        found.append({"position": gates[i]["centre"].tolist(), **way, "width": width, "height": height})
+    notes = [f"a lap of {lap} gates, flown {len(order) / lap:.1f} times", "openings lie between the inner corners"]
+    return {"gates": found, "closed": True, "notes": [*notes, "gates stand where they were seen in the median"]}
 
 
 def posed(centres: Any, rotations: Any) -> list[dict[str, Any]]:

@@ -187,6 +187,11 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_th
     ("x.toml", TOML, r"choose one drone of the file, by entry='a' or another of"),
     ("x.xacro", "", "a .xacro file has to be run before its numbers can be read. Expand it first"),
     ("x.toml", "[cf2x]\nacc_coef = 1", "this file is of no kind that is known. These can be read"),
+    (
+        "x.toml",
+        "[cf2x]\nacc_coef = 1\nrpy_coef = [1.0]",
+        "a model fitted to attitude commands .* has no rotors. Give the params.toml of first",
+    ),
     ("x.stl", "", "no drone can be read from a .stl file. These can be read"),
     ("x.yaml", "mass: 1", "has fields of our own format, which load_drone reads, and no others"),
     ("x.yaml", "{mass: 1, arm_length: 0.2, TWR_max: 5, omega_max_xy: 9}", "this file is of no kind that is known"),

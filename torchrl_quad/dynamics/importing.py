@@ -200,6 +200,12 @@ def _read(drone: Any, entry: str | None, fields: Mapping[str, Any]) -> tuple[str
         names = f"entry={next(iter(drones))!r} or another of {shown(list(drones))}"
         raise UserValueError(f"{source}: choose one drone of the file, by {names}; got {shown(entry)}.")
     own = set(FIELDS) & set(data) if isinstance(data, Mapping) else set()  # others, too, say "mass"
+    parts = [data, *data.values()] if isinstance(data, Mapping) else []
+    if any(isinstance(part, Mapping) and "rpy_coef" in part for part in parts):
+        raise UserValueError(
+            f"{source}: a model fitted to attitude commands (so_rpy of drone-models) has no rotors. Give the "
+            "params.toml of first_principles beside it."
+        )
     if not drones and not isinstance(drone, Mapping) and not (own and 2 * len(own) > len(data)):
         raise UserValueError(f"{source}: this file is of no kind that is known. {READABLE}")
     if not drones:

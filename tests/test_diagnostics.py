@@ -164,6 +164,27 @@ class CrashedEnv(HoveringEnv):
         return torch.ones_like(state["step"], dtype=torch.bool)
 
 
+class EasyEnv(HoveringEnv):
+    """Every state is a success, and the observation has a large constant."""
+
+    def is_success(self, state):
+        return torch.ones_like(state["step"], dtype=torch.bool)
+
+    def is_crash(self, state):
+        return state["step"] > 5
+
+    def observe(self, state):
+        return torch.cat((super().observe(state), torch.full_like(state["velocity"], 1e4)), -1)
+
+
+def test_a_success_that_is_always_true_and_a_large_observation_are_traps_and_a_crash_is_no_success():
+    always, large = audit_reward(*fly(EasyEnv, 12, weights=NO_ATTITUDE), gamma=0.99).traps
+    assert always.startswith("success is true in every step")
+    assert large.startswith(
+        "the observation has entries of more than a hundred in the mean: 13 (1e+04), 14 (1e+04), 15"
+    )
+
+
 NO_ATTITUDE = {"attitude": 0.0}
 
 

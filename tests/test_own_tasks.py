@@ -15,7 +15,7 @@ from small_runs import SMALL, rows
 from test_configuration import composed
 from test_docs import ROOT, files, importable  # noqa: F401, a fixture
 
-from torchrl_quad import HoveringEnv, QuadrotorEnv, available_tasks, make_env, register_task
+from torchrl_quad import HoveringEnv, QuadrotorEnv, TrackingEnv, available_tasks, make_env, register_task
 from torchrl_quad.envs import TASKS, registry
 from torchrl_quad.training.checkpoints import read_checkpoint
 from torchrl_quad.training.configuration import defaults
@@ -59,7 +59,7 @@ def test_what_is_no_task_is_refused_when_it_is_registered(name, cls, error, mess
 @cases(
     ("window", "Unknown task 'window'. Choose from: .*racing.* give the path .*, or call register_task"),
     ("no_package.WindowEnv", "Python finds no module 'no_package'. Put its folder on PYTHONPATH, or install"),
-    ("own_task.Corner", "the module 'own_task' .* has no 'Corner'"),
+    ("own_task.Corner", "the module 'own_task' .* has no 'Corner'. Write one of: own_task.CornerEnv"),
     ("own_task.norm", "a task is a subclass of QuadrotorEnv"),
 )
 def test_recipes_say_in_one_line_how_a_task_that_they_do_not_know_becomes_known(task, message, refused, tmp_path):
@@ -153,3 +153,24 @@ def test_a_metric_that_is_described_and_not_given_is_named():
             return {}
 
     refuses(r"SilentEnv.metrics\(state\) lacks corner_error, which metric_info describes", SilentEnv)
+
+
+def test_what_a_start_does_not_have_yet_is_named():
+    class EarlyEnv(CornerEnv):
+        def initial_state(self, n):
+            start = super().initial_state(n)
+            return {**start, "late": 0.1 * self.hover_state(start["position"])["step"]}
+
+    refuses("EarlyEnv.initial_state asks for 'step', which hover_state does not give: it has position, ", EarlyEnv)
+
+
+@pytest.mark.parametrize("task", [HoveringEnv, TrackingEnv])
+def test_an_episode_is_solved_by_a_success_of_your_own(task):
+    class Own(task):
+        def is_success(self, state):
+            return state["step"] % 2 == 0
+
+    for steps, solved in ((4, 1.0), (3, 0.0)):
+        env = Own(num_envs=2, max_episode_steps=steps)
+        metrics = env.episode_metrics(env.rollout(steps, auto_reset=True))
+        assert metrics["solved"].tolist() == [solved] * 2

@@ -104,7 +104,8 @@ def audit_reward(
     A verdict holds for this rollout alone, of any differentiable environment. Start it where all terms are paid, and
     make it longer than the delay between an action and its effect. Its ``traps`` mislead a policy: waiting pays
     more than an arrival after which the target jumps; dying is cheap where steps pay less than nothing; loitering pays
-    more than a success that ends the episode; a term is flat in most flights, or too small to matter. To go on counts
+    more than a success that ends the episode; success is always true; a term is flat in most flights, or too small to
+    matter; an observation is far from one. To go on counts
     as 1 / (1 - gamma) steps, for a gamma of 1 as the horizon.
 
     Args:
@@ -182,6 +183,7 @@ def audit_reward(
     audit.unseen = [name for name in said if name != "terminated" and not ends[name].any()]
     traps = [*_jumping(reward.detach(), done, rollout.get((*beside, "state"), None))]
     traps += _ending(reward.detach(), ends, shape[-2] if gamma == 1.0 else 1.0 / (1.0 - gamma))
+    traps += _large(rollout.get("observation", None))
     for name, x in audit.items():
         if x.verdict == "differentiable":
             traps += _flat(name, terms[name], returns[name], grads[name][len(sources) :])
@@ -222,8 +224,9 @@ def _jumping(reward: Tensor, done: Tensor, state: Any) -> Iterator[str]:
 def _ending(reward: Tensor, ends: Mapping[str, Tensor], steps: float) -> Iterator[str]:
     """Ends of episodes that pay more than going on, and successes that pay less."""
     never = torch.zeros_like(reward, dtype=torch.bool)
-    terminated, success = (ends.get(name, never) for name in ("terminated", "success"))
-    died, won = terminated & ~success, terminated & success
+    terminated, success, crash = (ends.get(name, never) for name in ("terminated", "success", "crash"))
+    won = terminated & success & ~crash
+    died = terminated & ~won
     usual = reward[~terminated].mean().item()
     cost = reward[died].mean().item() if died.any() else 0.0
     if ("crash" in ends or died.any()) and usual < 0.0 and cost > steps * usual:
@@ -232,12 +235,26 @@ def _ending(reward: Tensor, ends: Mapping[str, Tensor], steps: float) -> Iterato
             f"a step pays {usual:.3g} on average, {steps * usual:.3g} in {steps:.0f} steps, and a crash {seen}: dying "
             "is cheap. Add a constant, so that a good step pays more than nothing, or let a crash cost more"
         )
+    if success.all():
+        yield "success is true in every step: an untrained policy solves the task. Ask for more in is_success"
     before, ended = reward[..., :-1, :][won[..., 1:, :]], reward[..., 1:, :][won[..., 1:, :]]
     if len(before) and (loitering := steps * before.mean().item()) > ended.mean().item():
         yield (
             f"success ends an episode and pays {ended.mean().item():.3g}, while going on as in the step before it pays "
             f"{loitering:.3g} in {steps:.0f} steps: loitering pays more. Let success pay more, or the episode go on"
         )
+
+
+def _large(observation: Any) -> Iterator[str]:
+    """Entries of the observation that drown the others in a network."""
+    if isinstance(observation, Tensor) and observation.is_floating_point():
+        size = observation.detach().abs().flatten(0, -2).mean(0)
+        if large := (size > 100.0).nonzero().flatten().tolist():
+            which = ", ".join(f"{i} ({size[i]:.3g})" for i in large[:5])
+            yield (
+                f"the observation has entries of more than a hundred in the mean: {which}. They drown the others: "
+                "scale each to about one, and leave out what never changes"
+            )
 
 
 def _flat(name: str, term: Tensor, returns: Tensor, grads: Sequence[Tensor | None]) -> Iterator[str]:

@@ -189,7 +189,9 @@ def imported(path: str, what: str = "task") -> Any:
         mend = "Put its folder on PYTHONPATH, or install its package."
         raise UserValueError(f"{what} {path!r}: Python finds no module {error.name!r}. {mend}") from None
     if not hasattr(found, name):
-        raise UserValueError(f"{what} {path!r}: the module {module!r} ({found.__file__}) has no {name!r}.")
+        own = [f"{module}.{x}" for x, y in vars(found).items() if isinstance(y, type) and y.__module__ == module]
+        mend = f" Write one of: {', '.join(own)}." if own else ""
+        raise UserValueError(f"{what} {path!r}: the module {module!r} ({found.__file__}) has no {name!r}.{mend}")
     return getattr(found, name)
 
 

@@ -158,7 +158,13 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         self._params = params if params.requires_grad or params.rotor_effectiveness is not None else self.nominal
         self.randomness.seed(seed)
         self.set_up()
-        self.task_entries = [key for key in self.initial_state(num_envs) if key not in self.dynamics.sizes]
+        try:
+            self.task_entries = [key for key in self.initial_state(num_envs) if key not in self.dynamics.sizes]
+        except KeyError as error:
+            raise UserValueError(
+                f"{type(self).__name__}.initial_state asks for {error}, which hover_state does not give: it has "
+                f"{', '.join(self.dynamics.sizes)}. What the environment adds, such as step, comes after it."
+            ) from error
         state = sample_state(self, num_envs)
         check_task(self, state)
         self._connect(state)

@@ -26,13 +26,14 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 import torchrl_quad
 from torchrl_quad import (
+    QuadrotorEnv,
     VisitedStateBuffer,
     audit_reward,
     compare_gradients,
     differentiable_rollout,
     gradient_statistics,
 )
-from torchrl_quad.errors import Diverged, UserValueError
+from torchrl_quad.errors import Diverged, UserError, UserValueError
 from torchrl_quad.files import replacing
 from torchrl_quad.objectives import PathwiseCriticLoss, PathwiseLoss
 from torchrl_quad.training import drawing
@@ -304,6 +305,9 @@ class Run:
             now = {**self.cfg, "episodes": episodes, "solved": metrics["eval/solved"]}
             drawing.draw_flight(flight, self.folder / "flight", self.env, title(now))
             self.logs.show_flight(self.steps)
+        late = [i >= 4 and x["steps"] >= 0.1 * self.total_steps for i, x in enumerate(self.rows)]
+        if sum(late) == 1 and late[-1] and not any(x["eval/solved"] for x in self.rows):
+            self._warn(metrics["eval/crash"])
         score = {name: metrics[f"eval/{name}"] for name in ("solved", "return")}
         patience = self.cfg.eval.patience
         if math.isfinite(score["return"]) and merit(score, patience) >= merit(self.best, patience):
@@ -321,6 +325,21 @@ class Run:
         # The weights of which the best policy was the mean may be poor.
         self.actor.load_state_dict(self.flown.state_dict())
         self.carry = self.env.reset()
+
+    def _warn(self, crash: float) -> None:
+        """Say why a run that has solved nothing may never learn: the traps of the reward, and the time limit."""
+        if not isinstance(self.task, QuadrotorEnv):
+            return
+        with torch.random.fork_rng(), drawing_from(self.env, self.cfg.eval.seed):
+            rollout, _ = differentiable_rollout(self.env, self.actor, self.carry, self.horizon)
+            try:
+                traps = audit_reward(rollout, self.actor, gamma=self.cfg.gamma).traps
+            except UserError as error:
+                traps = [str(error)]
+        seconds = self.task.max_episode_steps * self.task.control_dt
+        limit = f"all episodes end by their time limit of {seconds:.3g} s: if that is too short, set max_episode_steps"
+        for trap in [*traps, limit] if crash < 0.05 else traps:
+            torchrl_logger.warning(f"Nothing is solved after {self.steps:,} steps. Perhaps {trap}.")
 
     def _diagnose(self) -> dict[str, float]:
         """Measure what reward and gradient of the next horizon are made of; change nothing."""

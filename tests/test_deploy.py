@@ -239,6 +239,7 @@ def test_a_contract_says_what_the_environment_is(hovering):
     assert 0 < low[2] < high[2] < 6 and about["envelope"]["max_speed"] > 0.1
     page = (hovering / "README.md").read_text()
     assert "| 0 | thrust | 0 | 13.5378 | N |" in page and "target - position           3     m, world frame" in page
+    assert "| 1 | 0.05303 | 0.05303 | clockwise |\n| 2 | -0.05303 | 0.05303 | counter-clockwise |" in page
 
 
 def test_the_rate_loop_of_a_contract_is_that_of_the_simulator(hovering):

@@ -295,6 +295,33 @@ def test_what_is_not_a_disturbance_is_refused(wrong, error, message):
     refuses(message, HoveringEnv, error=error, num_envs=1, disturbances=wrong, dynamics="point_mass")
 
 
+class Faulty(Disturbance):
+    """Returns what it is told to."""
+
+    def __init__(self, start, changed, seen):
+        self.given, self.changed, self.seen = start, changed, seen
+
+    def start(self, random, state):
+        return self.given
+
+    def advance(self, state, noise, dt):
+        return self.changed
+
+    def observe(self, state):
+        return {**state, **self.seen} if isinstance(self.seen, dict) else self.seen
+
+
+@cases(
+    ({}, None, {}, "Faulty.advance must return a mapping of the entries that it changes, or {}; got NoneType"),
+    ({}, {}, None, "Faulty.observe must return the whole state. Start from {..state, ...}"),
+    ({("drone", "mass"): -torch.ones(1, 1)}, {}, {}, r"entry \('drone', 'mass'\) must be finite and, .* above zero"),
+    ({}, {"angular_velocity": torch.zeros(1, 3)}, {}, "'angular_velocity', which follows the .* would be undone.$"),
+)
+def test_what_a_disturbance_does_wrong_is_named(start, changed, seen, message):
+    dynamics = "point_mass" if changed else "quadrotor"
+    refuses(message, HoveringEnv, num_envs=1, disturbances=[Faulty(start, changed, seen)], dynamics=dynamics)
+
+
 def test_a_weight_may_be_changed_and_an_unknown_one_is_named():
     usual, other = HoveringEnv(num_envs=2), HoveringEnv(num_envs=2, weights={"velocity": 0.0, "position": 1.0})
     state = usual.rollout(5)["next", "state"][:, -1]

@@ -313,7 +313,9 @@ SQUARE = {"position": [0, 0, 2], "yaw": 0.0, **OPEN}
 
 
 @cases(
-    ({**AGILE, "gates": ROW}, {}, "how far it is open is not said. Give width and height, or radius"),
+    ({**AGILE, "gates": ROW}, {}, "how far it is open is said by nothing. Give width and height, or radius"),
+    ({"gates": [{**SQUARE, "radius": 1.0}] * 2}, {}, "is said by height and radius and width. Give width and"),
+    ({"width": 1.0, "height": 1.0}, {}, "gates must be a list of points"),
     ({**AGILE, "gates": {**ROW, "Gate2": {"position": [8, 0, 2], "rotation": [0.7071, 0, 0, 0.7071]}}}, {"radius": 1.0},
      "their order does not show which. Give axis="),
     ({**AGILE, "gates": ROW}, {"radius": 1.0, "axis": "z"}, "axis must be one of x, y, -x, -y; got 'z'"),

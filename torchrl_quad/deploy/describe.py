@@ -328,7 +328,7 @@ def write_page(contract: Contract, documentation: str | None) -> bytes:
         for side in ("reads", "writes")
         for name, x in sides[side].items()
     ]
-    camera, delay, dt = contract["camera"], contract["action_delay"], contract["control_dt"]
+    camera, delay, dt, drone = (contract[x] for x in ("camera", "action_delay", "control_dt", "drone"))
     drawn = contract["randomized"].get("delay", {}).get("any")  # by randomize="any"
     flown = "drones from the ranges in `randomized`, of which the one in `drone` is the middle"
     lines = inspect.cleandoc(documentation or "There is none.").splitlines()
@@ -350,6 +350,10 @@ def write_page(contract: Contract, documentation: str | None) -> bytes:
             )
         ),
         "law": output["law"],
+        "rotors": "\n".join(
+            f"| {i} | {place[0]:.4g} | {place[1]:.4g} | {'counter-clockwise' if spin < 0 else 'clockwise'} |"
+            for i, (place, spin) in enumerate(zip(drone["rotor_positions"], drone["rotor_spin"], strict=True), 1)
+        ),
         "weight": f"{output['thrust']['weight']:.6g}",
         "hover": ", ".join(f"{x:.6g}" for x in output["hover_action"]),
         "control_dt": f"{dt:g}",

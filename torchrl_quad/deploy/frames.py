@@ -9,8 +9,8 @@
     thrust_z = px4.thrust(thrust, full_thrust=weight / hover_thrust)
 
 Ours: a world with z up, in which x and y may point anywhere; body x forward, y left, z up (FLU); quaternions
-(w, x, y, z) from body to world; rotors front left, back left, back right, front right, unless
-:meth:`Convention.of` is told otherwise. Where a target has a north, say
+(w, x, y, z) from body to world; rotors front left, back left, back right, front right: a drone that lists them
+otherwise needs ``px4.of(drone.rotor_positions)``, see :meth:`Convention.of`. Where a target has a north, say
 where our x and y point: ``world="enu"``, x east and y north, or ``world="nwu"``, x north and y west.
 
 Everything broadcasts over leading dimensions. ``docs/deploy_autopilots.md`` says which facts were read in the source of
@@ -56,7 +56,7 @@ class Convention:
     ``angular_velocity``  3      [rad/s], as measured, body frame
     ``body_rate``         3      as commanded: ours [rad/s], body frame; theirs in ``rates``, see below
     ``motors``            4      anything that belongs to a motor each; ours front left, back left, back right, front
-                                 right, as the presets list them, or as a drone does: see :meth:`of`
+                                 right, or as the drone lists its own: see :meth:`of`
     ====================  =====  ===================================================================================
     """
 

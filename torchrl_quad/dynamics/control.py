@@ -182,7 +182,7 @@ def _check_hover(nominal: QuadrotorParams, speed: Tensor, share: Tensor) -> None
         raise UserValueError(
             f"drone: to hover, its rotors would have to carry {shown(share.tolist())} of the weight each, and each "
             "must carry a part. Put the centre of mass, x = y = 0, between the rotors of rotor_positions, and let "
-            "rotor_direction point up."
+            "rotor_direction point up; of four rotors neighbours spin opposite ways, rotor_spin."
         )
     low, high, most = nominal.rotor_speed_min, nominal.rotor_speed_max, nominal.max_thrust_to_weight
     if not ((low < speed) & (speed < high)).all():

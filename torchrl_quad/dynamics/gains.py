@@ -36,8 +36,8 @@ def rate_loop(drone: QuadrotorParams, dt: float, **changed: Array) -> RateLoop:
 def suggest_gains(drone: str | Path | Mapping | QuadrotorParams, dt: PhysicsStep = 0.005) -> dict[str, Tensor]:
     """Gains of the rate loop for a drone whose own are unknown: ``drone.replace(**suggest_gains(drone))``.
 
-    The loop gets the greatest bandwidth with which its damping ratio is at least 0.8 in these steps and, at hover, a
-    command of the full body rate asks for no more torque than the rotors have. D is at most J.
+    The loop gets about the greatest bandwidth with which its damping ratio is at least 0.8 in these steps and, at
+    hover, a command of the full body rate asks for no more torque than the rotors have. D is at most J.
 
     Args:
         drone: :class:`QuadrotorParams`, a preset, a YAML file or a mapping, which may leave out the gains.

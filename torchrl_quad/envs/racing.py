@@ -63,13 +63,14 @@ class RacingEnv(QuadrotorEnv):
     distance from the axis, and by the drone's way beyond the gate, which for a drone slower than 1 m/s begins up to
     half of the smallest opening before the gate; v_t is how fast the way over that point gets shorter. Where that way
     passes an obstacle of the scene within two radii of the drone, v_t and v_a are about the direction that clears it. A
-    step that crosses the plane of the gate elsewhere, or touches a frame, takes up to a bonus away, tanh(m) of it at m
-    [m] from half of the opening. A drone pays 0.5 log(a / 15) for each side of the box ahead, and for the nearest
-    obstacle or frame, that takes a > 15 m/s2 to stop before, a = v^2 / (2 d) with the speed v towards it and the
-    distance d, since a crash has no gradient; with spheres, too, by ``weights={"closing": 0.5}``.
+    step that crosses the plane of the gate elsewhere, or touches a frame and does not pass, takes up to a bonus away,
+    tanh(m) of it at m [m] from half of the opening. A drone pays 0.5 log(a / 15) for each side of the box ahead, and
+    for the nearest obstacle or frame, that takes a > 15 m/s2 to stop before, a = v^2 / (2 d) with the speed v towards
+    it and the distance d, since a crash has no gradient; with spheres, too, by ``weights={"closing": 0.5}``.
 
     A point is passed when the straight line of a control step comes within 0.3 m of it, a gate with a direction when
-    that line crosses its plane, from behind, within its opening. The reward of that step is about the gate after it.
+    that line crosses its plane, from behind, within its opening; one gate at most counts in a step. The reward of that
+    step is about the gate after it.
 
     Start: level and at rest before a gate drawn at random, uniformly within 0.2 m along each axis of its start point.
     State added: ``gate`` (1), the index of the next; ``target`` (3) [m], its centre; ``gate_passed`` (1), whether this

@@ -23,6 +23,9 @@ from torchrl_quad.envs.terms import Event
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.vision import DepthCamera
 
+#: Fields of a drone that must be above zero.
+POSITIVE = ("mass", "inertia", "motor_time_constant")
+
 
 class Task(abc.ABC):
     """The part of an environment that its author writes; :class:`~torchrl_quad.QuadrotorEnv` inherits from it.
@@ -263,6 +266,8 @@ def check_task(env: Task, state: State) -> None:
         if isinstance(key, tuple) and key[0] == "drone" and key[1] not in fields:
             raise UserValueError(f"Entry {key!r} changes no parameter of the drone. Choose from: {', '.join(fields)}.")
         if isinstance(key, tuple) and key[0] == "drone":
+            is_right = x.isfinite().all() and (key[1] not in POSITIVE or (x > 0).all())
+            check(bool(is_right), f"initial_state: entry {key!r} must be finite and, as in any drone, above zero.")
             one = env.nominal.value(key[1])
             shape = (n, *one.shape[-env.nominal.dim(key[1]) :])
             fits = x.shape == shape or key[1] == "motor_time_constant"  # which may be two
@@ -309,12 +314,23 @@ def check_changes(env: Task, state: State) -> None:
     for disturbance in env.disturbances.values():
         noise = state["position"].new_zeros(env.num_envs, disturbance.noise_size) if disturbance.noise_size else None
         who = f"{type(disturbance).__name__}.advance"
-        for key, x in disturbance.advance(dict(state), noise, env.control_dt).items():
+        changed = disturbance.advance(dict(state), noise, env.control_dt)
+        if not isinstance(changed, Mapping):
+            got = type(changed).__name__
+            raise UserValueError(f"{who} must return a mapping of the entries that it changes, or {{}}; got {got}.")
+        if not isinstance(seen := disturbance.observe(dict(state)), Mapping) or not state.keys() <= seen.keys():
+            raise UserValueError(
+                f"{type(disturbance).__name__}.observe must return the whole state. Start from {{**state, ...}}."
+            )
+        for key, x in changed.items():
             if key in commanded:
+                motor = (
+                    ' A motor that fails has a ("drone", "rotor_effectiveness") of 0: give that in start and in '
+                    "advance, (num_envs, n) for n rotors."
+                )
                 raise UserValueError(
                     f"{who} writes {key!r}, which follows the command within the next control step: the change would "
-                    'be undone. A motor that fails has a ("drone", "rotor_effectiveness") of 0: give that in start and '
-                    "in advance, (num_envs, n) for n rotors."
+                    f"be undone.{motor if 'rotor_effectiveness' in env.dynamics.plant_fields else ''}"
                 )
             if key not in state:
                 raise UserValueError(

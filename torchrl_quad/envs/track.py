@@ -80,10 +80,12 @@ class Gate:
             raise UserValueError("give a yaw, and a pitch if wanted, or a rotation (w, x, y, z), not both.")
         if self.rotation is not None and abs(math.hypot(*self.rotation) - 1.0) > 0.01:
             raise UserValueError(f"its rotation must be a unit quaternion (w, x, y, z); got {shown(self.rotation)}.")
-        if {name for name in _OPENING if getattr(self, name) is not None} not in ({"width", "height"}, {"radius"}):
+        said = {name for name in _OPENING if getattr(self, name) is not None}
+        if said not in ({"width", "height"}, {"radius"}):
             raise UserValueError(
-                "how far it is open is not said. Give width and height, or radius [m], once for the track or for each "
-                "gate: load_track(..., width=1.5, height=1.5), or env.track={file: ..., width: 1.5, height: 1.5}."
+                f"how far it is open is said by {' and '.join(sorted(said)) or 'nothing'}. Give width and height, or "
+                "radius [m], once for the track or for each gate: load_track(..., width=1.5, height=1.5), or "
+                "env.track={file: ..., width: 1.5, height: 1.5}."
             )
 
     def entries(self) -> dict[str, Any]:
@@ -208,7 +210,7 @@ def load_track(track: str | Path | Mapping = "visfly", **settings: Any) -> dict[
         directed = _directed(source, _rows(raw), shape, "gate_radius" in found)
         raw, turned = ([gate[key] for gate in directed] for key in ("position", "rotation"))
         turned = torch.tensor(turned, dtype=torch.float64)
-    elif extra := [key for key in (*shape, "frame", "rotation_jitter") if key in {**shape, **found}]:
+    elif _rows(raw) and (extra := [x for x in (*shape, "frame", "rotation_jitter") if x in {**shape, **found}]):
         raise UserValueError(
             f"{source}: {extra[0]} is of gates with a direction; these are points, with a gate_radius."
         )

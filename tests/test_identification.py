@@ -244,17 +244,15 @@ def test_what_contradicts_the_drone_is_found_and_no_inertia_is_one_that_no_body_
     short, options = dataclasses.replace(real, segments=((300, 700),)), {"fields": ["linear_drag"], "draws": 0} | BRIEF
     turned = "the other way than the drone's.*Write rotor_spin: .1, -1, 1, -1. in the drone"
     refuses(turned, identify, short, "crazyflie", {"rotor_spin": [-1, 1, -1, 1]}, **options)
-    for fields in (["linear_drag"], ["thrust_map", "linear_drag"]):  # a fitted thrust does not hide it
-        fit = options | {"fields": fields, "iterations": 1}
-        for mass in (0.06, 0.02):
-            message = f"left over .*mass of {mass} kg or its thrust"
-            said = refuses(message, identify, short, "crazyflie", {"mass": mass}, **fit)
-            curve = json.loads(re.search(r'known={"thrust_map": (.*)}', said)[1])
-            identify(short, "crazyflie", {"mass": mass, "thrust_map": curve}, **options | {"iterations": 1})
+    heavy = r"left over .*mass of 0.06 kg or its thrust.*name \"thrust_map\" in fields"
+    refuses(heavy, identify, short, "crazyflie", {"mass": 0.06}, iterations=1, **options)
     large = dataclasses.replace(short, battery_voltage=10.0 * real.battery_voltage)
     refuses("a battery has 3.* V in the mean, and the drone's motor_command is for", identify, large, **options)
     result = identify(short, iterations=1, **options)
     assert max(map(abs, result.trim["force_per_weight"])) < 0.1 and set(result.errors_by_flight) == {"figure8"}
+    strong = dataclasses.replace(result, drone=result.drone.replace(thrust_map=1.8 * result.drone.thrust_map))
+    assert "per mass the rotors give 1.80 times the thrust of the given drone" in strong.verdict
+    assert "thrust" not in result.verdict
     worse = {**result.errors, "fitted": {name: {0.2: 9.0} for name in result.errors["fitted"]}}
     assert "the fit predicts worse than constant velocity: position (9 against" in dataclasses.replace(
         result, errors=worse).verdict  # fmt: skip

@@ -127,7 +127,7 @@ def identify(
     found = parameters["command_delay"]["value"] if "command_delay" in parameters else motors.delay
     motors = dataclasses.replace(motors, delay=float(np.clip(found, -0.1, 0.5)))  # what a drone's file may say
     fitted = QuadrotorParams(**model.params(state.x)._asdict(), motor_command=motors)
-    left = _checked_trim(logs, prior, fitted, past, "thrust" in state.free)
+    left = _checked_trim(logs, fitted, past, "thrust" in state.free)
     errors, by_flight = _errors(logs, {"fitted": fitted, "prior": prior}, past, horizon)
     half = quantile * cover.diag()[n:].clamp_min(0.0).sqrt() * UNKNOWNS["stream"].scale
     ends = zip(state.streams.tolist(), (state.streams - half).tolist(), (state.streams + half).tolist(), strict=True)
@@ -198,24 +198,22 @@ def _check_turning(prior: QuadrotorParams, logs: Sequence[FlightLog]) -> None:
 
 
 def _checked_trim(
-    logs: Sequence[FlightLog], prior: QuadrotorParams, fitted: QuadrotorParams, past: float, fits_thrust: bool
+    logs: Sequence[FlightLog], fitted: QuadrotorParams, past: float, fits_thrust: bool
 ) -> dict[str, list[float]]:
-    """The mean force and torque that the fitted drone leaves over, refused beyond a fifth of the weight, also where a
-    fitted thrust hides it."""
-    left, before = prediction.trim(logs, fitted, past), prediction.trim(logs, prior, past)
-    if left is None or before is None:
+    """The mean force and torque that the fitted drone leaves over, refused beyond a fifth of the weight."""
+    left = prediction.trim(logs, fitted, past)
+    if left is None:
         return {}
-    hides = fits_thrust and before.force[2].abs() > _MOST_TRIM
-    x, y, z = off = (before if hides else left).force.tolist()
-    if math.hypot(*off) > _MOST_TRIM:
-        curve = [float(f"{k:.4g}") for k in (prior.thrust_map.flatten() / (1.0 - z)).tolist()]
-        rest = f' If that is its mass, write the thrust of these flights: known={{"thrust_map": {curve}}}.'
+    force, torque = left.force.tolist(), left.torque.tolist()
+    share = math.hypot(*force)
+    if share > _MOST_TRIM:
+        more = "" if fits_thrust else ' Or fit its thrust, too: name "thrust_map" in fields.'
+        along = ", ".join(f"{x:+.2f}" for x in force)
         raise UserValueError(
-            f"identify: {math.hypot(*off):.0%} of the drone's weight is left over ({x:+.2f}, {y:+.2f}, {z:+.2f} along "
-            f"x, y, z): its mass of {float(prior.mass):.3g} kg or its thrust is not that of these flights. Weigh it "
-            f'with its battery: known={{"mass": ...}}.{rest if abs(z) > _MOST_TRIM else ""}'
+            f"identify: {share:.0%} of the drone's weight is left over ({along} along x, y, z): its mass of "
+            f"{float(fitted.mass):.3g} kg or its thrust is not that of these flights. Weigh it with its battery.{more}"
         )
-    return {"force_per_weight": left.force.tolist(), "torque": left.torque.tolist()}
+    return {"force_per_weight": force, "torque": torque}
 
 
 @dataclasses.dataclass

@@ -64,14 +64,19 @@ class IdentificationResult:
 
     @property
     def verdict(self) -> str:
-        """Whether the fit predicts the held-out windows better than constant velocity does, and where it does not."""
+        """Whether the fit predicts the held-out windows better than constant velocity does, and where it does not; and
+        a thrust that differs from the drone's by more than a fifth, which a wrong mass does."""
         fitted, coasting = (self.errors[name] for name in ("fitted", CONSTANT_VELOCITY))
         horizon = max(fitted["position"])
         pairs = {name: (fitted[name][horizon], coasting[name][horizon]) for name in ERRORS}
         worse = [f"{name} ({a:.2g} against {b:.2g} {ERRORS[name]})" for name, (a, b) in pairs.items() if not a < b]
-        if worse:
-            return f"after {horizon:g} s the fit predicts worse than constant velocity: {', '.join(worse)}"
-        return f"after {horizon:g} s the fit predicts better than constant velocity in all"
+        fit = f"worse than constant velocity: {', '.join(worse)}" if worse else "better than constant velocity in all"
+        speed = float(self.prior.rotor_speed_max.max())
+        found, before = (
+            float(np.polyval(x.thrust_map.flatten().tolist(), speed) / x.mass.max()) for x in (self.drone, self.prior)
+        )
+        thrust = f"; per mass the rotors give {found / before:.2f} times the thrust of the given drone: weigh it"
+        return f"after {horizon:g} s the fit predicts {fit}{thrust if not 0.8 < found / before < 1.2 else ''}"
 
     def __str__(self) -> str:
         used, held = self.settings["windows"], self.settings["held_out"]

@@ -64,6 +64,10 @@ def test_a_drone_comes_from_a_file_or_a_mapping_as_well(tmp_path):
         r"it is that of a ring of 0.255 m radius, and the farthest rotor is 0.075 m from",
     ),
     (
+        {"rotor_positions": [[5.3, 5.3], [-5.3, 5.3], [-5.3, -5.3], [5.3, -5.3]]},
+        r"a ring of 0.0664 m radius, and the farthest rotor is 7.5 m from .*; rotor_positions are in m",
+    ),
+    (
         {"thrust_map": [-1e-6, 5e-3, 0.0]},
         r"must rise .* is \[0.0046\] at rotor_speed_min and \[-0.002\] at rotor_speed_max",
     ),
@@ -111,6 +115,7 @@ def test_gradients_flow_through_replace_to_and_construction_and_a_drone_in_float
         **VISFLY,
         "mass": 0.027,
         "inertia": [1e-8] * 3,
+        "rotor_positions": [[1e-3, 1e-3], [-1e-3, 1e-3], [-1e-3, -1e-3], [1e-3, -1e-3]],
         "yaw_torque_coefficient": 1e-5,
         "rate_gain": [20.0] * 3,
         "rate_damping": [0.0] * 3,
@@ -186,6 +191,8 @@ def test_drones_drawn_have_bodies_and_none_has_an_unstable_rate_loop():
     refuses("randomize: a drone: in steps of dt=0.005 s .* unstable", HoveringEnv, num_envs=1, randomize=unstable)
     HoveringEnv(num_envs=1, randomize=unstable, dt=0.001)
     refuses("unstable with an inertia of", env.set_params, env.params.replace(inertia=env.params.inertia * 0.1))
+    stronger = {"thrust_map": {"scale": [1.0, 20.0]}, "rotor_positions": {"scale": [0.5, 2.0]}}
+    refuses(r"rotors that give \[40.0, 40.0, 20.0\] times the torque", HoveringEnv, num_envs=1, randomize=stronger)
 
 
 def test_a_drone_shows_itself_as_a_table_with_units():

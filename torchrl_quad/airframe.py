@@ -31,12 +31,12 @@ def contradictions(fields: Mapping[str, ArrayLike]) -> Iterator[str]:
         yield f"inertia {listed(inertia)} kg m2: in a body none of the three exceeds the sum of the others. {units}"
     arm = np.sqrt((drone["rotor_positions"] ** 2).sum(-1)).max(-1)
     radius = np.sqrt(inertia.max(-1) / mass)
-    if (radius > 2.0 * arm).any():
-        worst = (radius - 2.0 * arm).argmax()
+    if (unlike := (radius > 2.0 * arm) | (arm > 10.0 * radius)).any():
+        worst = unlike.argmax()
         arm, radius = (np.broadcast_to(x, (radius - arm).shape).flat[worst] for x in (arm, radius))
         yield (
             f"inertia {listed(inertia)} kg m2: with this mass it is that of a ring of {radius:.3g} m radius, and "
-            f"the farthest rotor is {arm:.3g} m from the centre. {units}"
+            f"the farthest rotor is {arm:.3g} m from the centre. {units}; rotor_positions are in m"
         )
     if not (low < high).all():
         yield f"rotor_speed_min must be below rotor_speed_max, got {listed(low)} and {listed(high)}"

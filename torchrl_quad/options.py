@@ -234,6 +234,8 @@ def _checked(name: str, value: Any, adapter: TypeAdapter[Any], description: str)
         first, *others = refused.errors()
         if isinstance(error := first.get("ctx", {}).get("error"), Explained):
             raise UserValueError(f"{name}: {error}") from None
+        if isinstance(error, UserValueError) and str(error).startswith(name):  # which is a sentence of its own
+            raise error from None
         place = "".join(f"[{key}]" for key in first["loc"] if isinstance(key, int))
         choices = [must(error) for error in (first, *others) if error["input"] is first["input"]]
         said = f"{name}{place} must {' or '.join(dict.fromkeys(choices))}, got {shown(first['input'])}."

@@ -21,7 +21,7 @@ AXES = ("roll", "pitch", "yaw")
 MIN_CHECK = 1050  # [us], Betaflight's default
 TUNE = "# -- The rate loop"  # what begins the second part of betaflight.txt
 MOST_GAIN = 250  # that Betaflight takes
-UNTRIED = "for the policy of the task {!r}. These have not flown: try them on a stand."
+UNTRIED = "for the policy of the task {!r}. Not flown: try gains on a stand, and that rotors turn as README.md says."
 
 
 class Throttle(NamedTuple):

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl_quad.airframe import Array, RateLoop, listed
 from torchrl_quad.dynamics.control import FlightController
 from torchrl_quad.dynamics.parameters import QuadrotorParams, read_drone, read_fields
+from torchrl_quad.dynamics.rigid_body import Rotors
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.options import between, checked
 
@@ -110,18 +111,24 @@ def check_gains(controller: FlightController, dt: float, substeps: int) -> None:
     )
 
 
-def check_flown(nominal: QuadrotorParams, flown: QuadrotorParams, dt: float) -> None:
-    """Refuse a drone that flies, if with its inertia and motors the rate loop is unstable in physics steps of dt [s].
+def check_flown(controller: FlightController, flown: QuadrotorParams, dt: float) -> None:
+    """Refuse a drone that flies, if with its body, motors and rotors the rate loop is unstable in steps of dt [s].
 
     How well it is damped is left to the drone: a policy has to bear that.
     """
+    nominal, rotors, speed = controller.nominal, Rotors(flown), controller.hover_speed
+    steeper = rotors.curvature * (speed - rotors.vertex_speed)  # of thrust over speed, beside what the mixer expects
+    steeper = steeper / (controller.rotors.curvature * (speed - controller.rotors.vertex_speed))
+    torque = rotors.allocation[..., 1:4, :] * steeper.unsqueeze(-2) * controller.mixer[..., 1:4].mT
+    stronger = _numbers(torque.sum(-1))  # than what is asked for, about each axis at hover
     believed, true = ((_numbers(x.inertia), _numbers(x.motor_time_constant)) for x in (nominal, flown))
-    gain = _numbers(nominal.rate_gain) * believed[0] / true[0]
+    gain = _numbers(nominal.rate_gain) * believed[0] / true[0] * stronger
     if not rate_loop(nominal, dt, gain=gain, motor_time_constant=true[1]).is_stable.all():
         raise UserValueError(
-            f"drone: in steps of dt={dt:g} s the rate loop is unstable with an inertia of {listed(true[0])} kg m2 and "
-            f"motors of {listed(true[1])} s, since its gains are for {listed(believed[0])} and {listed(believed[1])}. "
-            "Choose them nearer to these, a smaller dt, or a drone with a lower rate_gain."
+            f"drone: in steps of dt={dt:g} s the rate loop is unstable with an inertia of {listed(true[0])} kg m2, "
+            f"motors of {listed(true[1])} s, and rotors that give {listed(stronger.round(2))} times the torque, since "
+            f"its gains are for {listed(believed[0])}, {listed(believed[1])} and 1. Choose them nearer to these, a "
+            "smaller dt, or a drone with a lower rate_gain."
         )
 
 

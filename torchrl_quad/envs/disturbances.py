@@ -137,9 +137,12 @@ class DroneRandomization(Disturbance):
         return drawn
 
     def liveliest(self, nominal: QuadrotorParams) -> Iterator[QuadrotorParams]:
-        """Of the drones that may be drawn those of the least inertia, with the quickest and with the slowest motors."""
+        """Of the drones that may be drawn those of the least inertia and the strongest rotors, with the quickest and
+        with the slowest motors."""
+        strong = dict.fromkeys(("thrust_map", "rotor_effectiveness", "yaw_torque_coefficient"), 1.0)
+        strong |= {"rotor_positions": 1.0} if "scale" in self.spec.get("rotor_positions", ()) else {}
         for sign in (-1.0, 1.0):
-            ends = {"inertia": -1.0, "motor_time_constant": sign}
+            ends = {"inertia": -1.0, "motor_time_constant": sign, **strong}
             ends = {k: self._value(k, torch.full_like(x, ends[k])) for k, x in self.nominal.items() if k in ends}
             yield nominal.replace(**ends)
 

@@ -201,38 +201,39 @@ def flown_track(path: Path) -> dict[str, Any]:
                 "Write your own track in YAML: gates, a list of [x, y, z]."
             )
         for row in reader:
-            rows.append([float(row[name] or "nan") for name in wanted])
+            try:
+                rows.append([float(row[name] or "nan") for name in wanted])
+            except ValueError as error:
+                raise UserValueError(
+                    f"{path}, line {reader.line_num}: {error}. Leave out the row, or the cell."
+                ) from None
     table = np.array(rows).reshape(-1, len(wanted))
     flown = table[np.isfinite(table[:, :3]).all(1), :3]
     if len(flown) < 2 or not np.isfinite(table[:, 3:]).any(0).all():
         raise UserValueError(f"{path}: the drone or a corner of a gate was never seen.")
-    gates, passed = [], []
-    for i, corner in enumerate(np.nanmedian(table[:, 3:], 0).reshape(count, 4, 3)):
+    passed: list[tuple[float, dict[str, Any]]] = []  # when, and the gate as it was flown
+    for corner in np.nanmedian(table[:, 3:], 0).reshape(count, 4, 3):
         centre = corner.mean(0)
         ahead = np.linalg.svd(corner - centre)[2][2]  # what the corners' plane is normal to
         left = np.cross([0.0, 0.0, 1.0], ahead)
         left /= np.linalg.norm(left).clip(1e-9)
         within = np.stack((left, np.cross(ahead, left)), 1)
         half = np.abs((corner - centre) @ within).mean(0)
-        gates.append({"centre": centre, "ahead": ahead, "size": 2.0 * half})
+        width, height = (2.0 * half).tolist()
+        place = {"position": centre.tolist(), "width": width, "height": height}
         side = (flown - centre) @ ahead
         for k in np.flatnonzero((side[:-1] < 0.0) != (side[1:] < 0.0)):
             share = side[k] / (side[k] - side[k + 1])
             if (np.abs((flown[k] + share * (flown[k + 1] - flown[k]) - centre) @ within) < half).all():
-                passed.append((k + share, i, 1.0 if side[k] < 0.0 else -1.0))
-    order = [x[1:] for x in sorted(passed)]
+                x, y, z = ahead if side[k] < 0.0 else -ahead
+                passed.append((k + share, {**place, "yaw": math.atan2(y, x), "pitch": math.asin(z)}))
+    order = [gate for _, gate in sorted(passed, key=lambda x: x[0])]
     enough = range(2, len(order) - len(order) // 3)  # half a lap, at least, must come again
     lap = next((k for k in enough if order[k:] == order[:-k]), None)
     if lap is None:
         raise UserValueError(f"{path}: the drone passed {len(order)} gates, and no lap twice. Give a longer flight.")
-    found = []
-    for i, sign in order[:lap]:
-        x, y, z = sign * gates[i]["ahead"]
-        width, height = gates[i]["size"].tolist()
-        way = {"yaw": math.atan2(y, x), "pitch": math.asin(z)}
-        found.append({"position": gates[i]["centre"].tolist(), **way, "width": width, "height": height})
     notes = [f"a lap of {lap} gates, flown {len(order) / lap:.1f} times", "openings lie between the inner corners"]
-    return {"gates": found, "closed": True, "notes": [*notes, "gates stand where they were seen in the median"]}
+    return {"gates": order[:lap], "closed": True, "notes": [*notes, "gates stand where they were seen in the median"]}
 
 
 def posed(centres: Any, rotations: Any) -> list[dict[str, Any]]:

@@ -314,7 +314,8 @@ class Faulty(Disturbance):
 @cases(
     ({}, None, {}, "Faulty.advance must return a mapping of the entries that it changes, or {}; got NoneType"),
     ({}, {}, None, "Faulty.observe must return the whole state. Start from {..state, ...}"),
-    ({("drone", "mass"): -torch.ones(1, 1)}, {}, {}, r"entry \('drone', 'mass'\) must be finite and, .* above zero"),
+    ({("drone", "mass"): -torch.ones(1, 1)}, {}, {}, "'mass'.*, from Faulty.start, must be finite and, .* above zero"),
+    ({"position": torch.zeros(1, 4)}, {}, {}, r"'position', from Faulty.start, must have shape \(1, 3\), got \(1, 4\)"),
     ({}, {"angular_velocity": torch.zeros(1, 3)}, {}, "'angular_velocity', which follows the .* would be undone.$"),
 )
 def test_what_a_disturbance_does_wrong_is_named(start, changed, seen, message):

@@ -252,26 +252,30 @@ def check_task(env: Task, state: State) -> None:
         return ((f"{method}[{name!r}]", x) for name, x in entries.items())
 
     taken = {"step", "action_queue", "collided", "drone", "scene"}
-    taken |= {key for x in env.disturbances.values() for key in x.start(env.randomness, state) if isinstance(key, str)}
+    starts = {key: type(x).__name__ for x in env.disturbances.values() for key in x.start(env.randomness, state)}
+    taken |= {key for key in starts if isinstance(key, str)}
     for key in taken & set(env.task_entries):
         check(False, f"initial_state: entry {key!r} is the environment's own; give yours another name.")
     fields, kinds = env.dynamics.plant_fields, (env.dtype, torch.int64, torch.bool)
     check_changes(env, state)
     for key, x in state.items():
+        entry = f"initial_state: entry {key!r}" + (f", from {starts[key]}.start," if key in starts else "")
         check(
             isinstance(x, Tensor) and x.dim() > 1 and len(x) == n and x.dtype in kinds,
-            f"initial_state: entry {key!r} must be a tensor ({n}, ...) of at least two dimensions, {env.dtype}, int64 "
-            f"or bool; got ({kind(x)}).",
+            f"{entry} must be a tensor ({n}, ...) of at least two dimensions, {env.dtype}, int64 or bool; got "
+            f"({kind(x)}).",
         )
+        if size := env.dynamics.sizes.get(key):
+            check(x.shape == (n, size), f"{entry} must have shape {(n, size)}, got {tuple(x.shape)}.")
         if isinstance(key, tuple) and key[0] == "drone" and key[1] not in fields:
             raise UserValueError(f"Entry {key!r} changes no parameter of the drone. Choose from: {', '.join(fields)}.")
         if isinstance(key, tuple) and key[0] == "drone":
             is_right = x.isfinite().all() and (key[1] not in POSITIVE or (x > 0).all())
-            check(bool(is_right), f"initial_state: entry {key!r} must be finite and, as in any drone, above zero.")
+            check(bool(is_right), f"{entry} must be finite and, as in any drone, above zero.")
             one = env.nominal.value(key[1])
             shape = (n, *one.shape[-env.nominal.dim(key[1]) :])
             fits = x.shape == shape or key[1] == "motor_time_constant"  # which may be two
-            check(fits, f"initial_state: entry {key!r} must have shape {shape}, got {tuple(x.shape)}.")
+            check(fits, f"{entry} must have shape {shape}, got {tuple(x.shape)}.")
     check_tensor("observe(state)", call("observe", state), env.dtype, None)
     terms, metrics, events = call("reward_terms", state), call("metrics", state), call("events", state, state)
     for method, term in named("reward_terms(state)", terms):

@@ -228,7 +228,7 @@ def print_summary(summary: Mapping[str, Any], metric_info: Mapping[str, Any], fo
     print(f"\n{_name(summary)}, {summary['episodes']} fresh episodes:")
     for name, metric in metric_info.items():
         if not math.isnan(summary.get(name, math.nan)):
-            print(f"  {metric.label:22s}{metric.format(summary[name])}")
+            print(f"  {metric.label:21s} {metric.format(summary[name])}")
     if "seconds" in summary:
         print(f"  {'training':22s}{summary['steps']:,} steps in {summary['seconds']:.1f} s")
     print(f"  {'results in':22s}{folder}")

@@ -65,7 +65,7 @@ def test_a_drone_comes_from_a_file_or_a_mapping_as_well(tmp_path):
     ),
     (
         {"rotor_positions": [[5.3, 5.3], [-5.3, 5.3], [-5.3, -5.3], [5.3, -5.3]]},
-        r"a ring of 0.0664 m radius, and the farthest rotor is 7.5 m from .*; rotor_positions are in m",
+        r"a ring of 0.0664 m radius, and the farthest rotor is 7.5 m from .*; mass is in kg, rotor_positions in m",
     ),
     (
         {"thrust_map": [-1e-6, 5e-3, 0.0]},

@@ -49,7 +49,7 @@ def test_an_unknown_option_is_refused_with_the_closest_one_and_all_of_them():
     ({"weights": {"velocity": nan}}, "weights: velocity must be a finite number, got nan"),
     ({"event_discount": 0}, "event_discount must be greater than 0, got 0. The discount per control step"),
     ({"event_discount": "gamma"}, "got 'gamma'. The discount .*; None for no gradient in it."),
-    ({"drone": visfly.replace(mass=460.0)}, r"to hover, its rotors would have to turn at .* Check mass \[kg\]"),
+    ({"drone": visfly.replace(mass=4.6)}, r"to hover, its rotors would have to turn at .* Check mass \[kg\]"),
     ({"drone": visfly.replace(max_thrust_to_weight=0.8)}, "max_thrust_to_weight .* must be above 1 to hover; got"),
     (
         {"drone": visfly.replace(rotor_positions=[[0.1 * i, 0.03 * i] for i in (-3, -1, 1, 3)])},

@@ -33,10 +33,11 @@ def contradictions(fields: Mapping[str, ArrayLike]) -> Iterator[str]:
     radius = np.sqrt(inertia.max(-1) / mass)
     if (unlike := (radius > 2.0 * arm) | (arm > 10.0 * radius)).any():
         worst = unlike.argmax()
-        arm, radius = (np.broadcast_to(x, (radius - arm).shape).flat[worst] for x in (arm, radius))
+        arm, radius, one = (np.broadcast_to(x, unlike.shape).flat[worst] for x in (arm, radius, mass))
         yield (
-            f"inertia {listed(inertia)} kg m2: with this mass it is that of a ring of {radius:.3g} m radius, and "
-            f"the farthest rotor is {arm:.3g} m from the centre. {units}; rotor_positions are in m"
+            f"inertia {listed(inertia)} kg m2: with a mass of {one:.4g} kg it is that of a ring of {radius:.3g} m "
+            f"radius, and the farthest rotor is {arm:.3g} m from the centre. {units}; mass is in kg, rotor_positions "
+            "in m"
         )
     if not (low < high).all():
         yield f"rotor_speed_min must be below rotor_speed_max, got {listed(low)} and {listed(high)}"

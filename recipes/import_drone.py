@@ -28,6 +28,8 @@ def main() -> None:
     output = Path(cfg.pop("output", None) or f"outputs/drones/{name}.yaml")
     if output.exists() and path.exists() and output.samefile(path):
         raise UserValueError(f"output={output} is the file that is read. Choose another.")
+    if output.suffix not in (".yaml", ".yml"):
+        raise UserValueError(f"output={output}: it is written in YAML, so its name must end in .yaml.")
     text = import_drone(path, **cfg)
     make_folder(output.parent)
     with replacing(output) as temporary:
@@ -43,6 +45,8 @@ def settings(arguments: list[str]) -> tuple[Path, dict[str, Any]]:
         name, equals, value = argument.partition("=")
         if not equals or name in cfg:
             raise UserValueError(f"{shown(argument)}: write each setting once, as name=value; the file comes first.")
+        if not value:
+            raise UserValueError(f"{name}= has no value. Write {name}=..., or leave it out.")
         cfg[name] = value if name in ("output", "entry") else presets.parse(value.encode(), name)
     return Path(path), cfg
 

@@ -108,6 +108,7 @@ HOVER, FAST = np.sqrt(9.81 * 2 / 4 / 1e-5), 2 * np.pi / 60  # of a rotor of the 
     ("x.yaml", json.dumps(AGILICIOUS), {}, {"rotor_positions": [CORNERS[i] for i in (0, 1, 3, 2)],
      "rotor_spin": [-1, -1, 1, 1], "thrust_map": [2e-6, 0, 0], "max_body_rate": [10, 10, 4],
      "linear_drag": [0.1, 0.1, 0.2]}),
+    ("x.yaml", json.dumps(AGILICIOUS | {"gravity": -3.7}), {}, {"gravity": 3.7}),
     ("x.yaml", FLIGHTMARE, {"linear_drag": [0.1] * 3, "rotor_speed_max": 3000}, {"rotor_spin": [1, -1, 1, -1],
      "inertia": [0.00791138, 0.00791138, 0.01230658]}),
     ("x.yaml", json.dumps(AGILICIOUS | {"aero_coeff_1": [0, 0, 0], "thrust_map": [5e-6, 0, 0]} | dict.fromkeys(
@@ -154,7 +155,11 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_th
     ),
     ("x.urdf", URDF.format("cf", 4e-4), r"inertia \[kg m2\]: its products of inertia are not small, 0.0004 kg m2"),
     ("x.sdf", sdf(FRAME + motors(motorConstant=2e-5)), "rotors differ in motorConstant"),
-    ("x.sdf", sdf(FRAME.replace(J, "") + motors()), "inertia .*: the link 'base_link' has a mass and no <inertia>"),
+    (
+        "x.sdf",
+        sdf(FRAME.replace(J, "") + motors()),
+        "inertia .*: the link 'base_link' has a mass, and no ixx, iyy and izz",
+    ),
     ("x.sdf", sdf(FRAME + motors() + "<plugin filename='gz-sim-lift-drag'/>"), r"it has wings \(LiftDrag\)"),
     ("x.sdf", sdf("<include><placement_frame>a</placement_frame></include>"), "a placement_frame is not read"),
     (
@@ -202,6 +207,23 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_th
     ("x.sdf", "<!DOCTYPE html><html></html>", "this is a web page. Download the file itself"),
     ("x.world", "<sdf><world><include/><model name='ground'/></world></sdf>", "Give the file of the drone's own model"),
     ("x.sdf", sdf(FRAME.replace("<inertial>", "<inertial auto='true'>", 1)), "computes the inertia of the link 'base"),
+    (
+        "x.urdf",
+        URDF.format("cf", 0).replace("<mass value='0.4'/>", "<mass>0.4</mass>"),
+        "'base_link' has an inertia without a m",
+    ),
+    (
+        "x.sdf",
+        sdf(FRAME.replace("<mass>1<", "<Mass>1<").replace("</mass>", "</Mass>", 1)),
+        "'base_link' has an inertia wi",
+    ),
+    ("x.sdf", sdf(FRAME.replace("izz", "jzz")), "'base_link' has a mass, and no ixx, iyy and izz"),
+    ("x.sdf.jinja", "<sdf>{% if heavy %}<mass>5</mass>{% endif %}</sdf>", "a template of Jinja, with '{% if heavy"),
+    ("x.urdf", URDF.format("cf", 0).replace("value='0.4'", "value='0'"), "mass .* it follows from thrust2weight"),
+    ("x.json", '{"k_eta": 1, "k_eta": 2}', "not a JSON file: .*k_eta.* has a name twice"),
+    ("x.json", json.dumps({**L2F, "J_inv": np.eye(3).tolist()}), "inertia .* J_inv is not the inverse of J"),
+    ("x.yaml", json.dumps(VISFLY | {"motor_omega_min": None, "thrust_map": [4e-7, -1e-5, 0]}), "rotor_speed_min=13.8"),
+    ("x.yaml", "{mass: 1, inertia: [1, 1, 1], T_bm: [0, 0, 1]}", "this file is of no kind that is known"),
     ("x.sdf", sdf(FRAME + motors() + TILTING), "the joint 'tilt' turns the rotor 'rotor_0', and rotors here are fixed"),
 )
 def test_what_cannot_become_a_drone_is_refused_with_all_that_is_missing(file, text, message, tmp_path):
@@ -209,7 +231,7 @@ def test_what_cannot_become_a_drone_is_refused_with_all_that_is_missing(file, te
     refuses(message, import_drone, tmp_path / file)
 
 
-def test_parts_of_a_model_stand_where_its_simulator_puts_them(tmp_path):
+def test_parts_of_a_model_stand_where_its_simulator_puts_them(tmp_path, monkeypatch):
     """A payload 0.2 m below the body, which is written in several ways; frames of masses turn no rotor."""
     given = {"yaw_torque_coefficient": 0.02}
     load = "<link name='load'><pose relative_to='{}'>0 0 {} 0 0 0</pose><inertial><mass>1</mass>" + J
@@ -238,6 +260,8 @@ def test_parts_of_a_model_stand_where_its_simulator_puts_them(tmp_path):
         height = 2 * 1 / 3 * (0.2 + 0.05) ** 2  # of the other 2 kg, whose centre is 5 cm above the body
         np.testing.assert_allclose(drone.inertia, [0.035 + height, 0.085 + height, 0.1], atol=1e-6, err_msg=way)
         assert drone.rotor_direction is None
+    monkeypatch.chdir(tmp_path / "2")
+    assert load_drone("MODEL.SDF", **given).mass.item() == 3.0
 
 
 def test_rotors_are_found_by_their_names_and_axes_and_what_follows_from_a_given_mass_follows(tmp_path):
@@ -272,6 +296,14 @@ def test_rotors_are_found_by_their_names_and_axes_and_what_follows_from_a_given_
     besides += "<joint name='m' type='fixed'><parent link='arm'/><child link='motor0_link'/></joint>"
     (tmp_path / "z.urdf").write_text(flat.replace("</robot>", besides + "</robot>"))
     assert len(load_drone(tmp_path / "z.urdf", torch.float64, motor_time_constant=0.05).rotor_positions) == 4
+    for rotor, other in (("motor_{}", "arm_motor_{}"), ("prop_{}_left", "rotor_mount_{}")):
+        arms = "".join(f"<link name='{other.format(i)}'><inertial/></link>" for i in range(4))
+        armed = flat.replace("</robot>", arms + "</robot>")
+        for i in range(4):
+            armed = armed.replace(f"motor{i}_link", rotor.format(i))
+        (tmp_path / "z.urdf").write_text(armed, encoding="utf-16")
+        named = load_drone(tmp_path / "z.urdf", torch.float64, motor_time_constant=0.05)
+        torch.testing.assert_close(named.rotor_positions, wanted.rotor_positions)
     lying = flat.replace("<origin xyz='0.2 -0.1 0'", "<origin xyz='0.2 0 0.1'").replace("</robot>", turned + "</robot>")
     (tmp_path / "y.URDF").write_text(lying)
     upright = load_drone(tmp_path / "y.URDF", torch.float64, motor_time_constant=0.05)
@@ -291,6 +323,10 @@ def test_the_recipe_writes_a_drone_from_a_model_and_what_it_includes(tmp_path, m
     monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "x.sdf"), "mass=3", f"output={tmp_path}/o/x.yaml"])
     runpy.run_path(str(script), run_name="__main__")
     assert load_drone(tmp_path / "o/x.yaml").mass == 3.0 and f"env.drone={tmp_path}/o/x.yaml" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "x.sdf"), "mass=3", "output=x.urdf"])
+    with pytest.raises(SystemExit):
+        runpy.run_path(str(script), run_name="__main__")
+    assert "its name must end in .yaml" in capsys.readouterr().err
     monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "frame.sdf")])
     with pytest.raises(SystemExit):
         runpy.run_path(str(script), run_name="__main__")

@@ -293,6 +293,17 @@ def test_tracks_of_other_projects_are_read_and_what_was_assumed_is_said(tmp_path
         assert [gate["position"] for gate in isaac["gates"]] == [[0, 0, 0.9], [4, 0, 1.9]]
     (tmp_path / "free.toml").write_text("\ufeff" + LSY.replace("obstacles = [{pos = [1.0, 0.75, 1.5]}]", ""))
     assert "scene" not in load_track(tmp_path / "free.toml")
+    # In the first versions gates are flown along y, which their order shows; bars are narrower. Others say a size.
+    first = LSY.replace("safety_limits = {", "other = {").replace("-0.78", "-2.35").replace("3.14]", "1.57]")
+    (tmp_path / "first.toml").write_text(first.replace("[env.r", "gate_size = {width = 1.5, height = 1.4}\n[env.r"))
+    first = load_track(tmp_path / "first.toml", box=[[-3, -3, 0], [3, 3, 2]])
+    assert forward(torch.tensor(first["gates"][0]["rotation"])).tolist() == pytest.approx(
+        [0.7071, -0.7071, 0], abs=5e-3
+    )
+    assert first["notes"][:2] == [
+        "gates are flown along their y axis",
+        "they are open 1.5 x 1.4 m, with frames of 0.09 m",
+    ]
     # The newest files have an order of passages, which may go backwards, and the oldest no limits and other words.
     gates = [{"pos": [x, 0, 1], "rpy": [0, 0, 0]} for x in (0, 2, 4)]
     own = {"gates": gates, "gate_order": [3, -1, 3], "drone": {"pos": [-1, 0, 0]}}

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from torchrl_quad.dynamics import presets
 from torchrl_quad.dynamics.parameters import FIELDS
-from torchrl_quad.errors import UserValueError, one_line
+from torchrl_quad.errors import UserValueError, one_line, shown
 
 Array = NDArray[np.float64]
 Found = dict[str, tuple[Any, str]]  # of a field: its value, None where there is none, and a note
@@ -30,21 +30,28 @@ GIVEN = "given, not in the file"
 def read_text(path: Path) -> str:
     """The content of a file of a reasonable size."""
     if not path.is_file():  # which a pipe or a device is not, whose reading may never end
-        raise FileNotFoundError(f"No drone file at {path}. Give the path of a file that exists.")
+        what = "it is a folder" if path.is_dir() else "there is none"
+        raise FileNotFoundError(f"No drone file at {path}: {what}. Give the path of a file that exists.")
     with path.open("rb") as file:
         content = file.read(presets.MAX_BYTES + 1)
     if len(content) > presets.MAX_BYTES:
         raise UserValueError(f"{path}: has more than {presets.MAX_BYTES:,} bytes. A drone needs less.")
-    return content.decode("utf-8-sig", "replace")
+    return content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig", "replace")
 
 
 def read_json(path: Path) -> Any:
     """The content of a JSON file."""
     text = read_text(path)
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=_once)
     except (ValueError, RecursionError) as error:
         raise UserValueError(f"{path}: not a JSON file: {one_line(error)}.") from None
+
+
+def _once(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    if len(found := dict(pairs)) < len(pairs):
+        raise ValueError(f"{shown([key for key, _ in pairs])} has a name twice")
+    return found
 
 
 class Said:
@@ -160,16 +167,20 @@ def _flightmare(said: Said) -> Found:
     drags = {name: said(name, 3) for name in ("aero_coeff_1", "body_drag_1", "linear_drag_coeffs")}
     for name in ("aero_coeff_{}_1", "linear_drag_coeff_{}"):
         x, y, z = (said(name.format(axis)) for axis in "xyz")
-        drags[name.format("x")] = None if x is None or y is None else np.array([x, y, z or 0.0])
+        part = "" if z is not None else "; 0 along z, of which it says nothing"
+        drags[name.format("x") + part] = None if x is None or y is None else np.array([x, y, z or 0.0])
     drags = {name: x for name, x in drags.items() if x is not None}
     named = next((name for name, x in drags.items() if x.any()), next(iter(drags), ""))  # zeros where all are
-    found["linear_drag"] = drags.get(named), named
+    other = "linear_drag_coeff is not read" if "linear_drag_coeff" in said.data else ""
+    found["linear_drag"] = drags.get(named), "; ".join(filter(None, (named, other)))
     if curve is None and most is not None and speed is not None:
         found["thrust_map"] = [most / speed**2, 0.0, 0.0], "from thrust_max at motor_omega_max, as the square of speed"
     elif curve is not None and most is not None and speed is not None and speed_at(most, curve) < speed:
         found["rotor_speed_max"] = speed_at(most, curve), "at thrust_max, before motor_omega_max"
     if (squares := said("quad_drag_coeffs", 3)) is not None and (areas := said("cross_sections", 3)) is not None:
         found["quadratic_drag"] = 0.5 * 1.225 * squares * areas, "of quad_drag_coeffs and cross_sections, in air"
+    if (gravity := said("gravity", *np.shape(said.data.get("gravity", ())))) is not None:
+        found["gravity"] = np.linalg.norm(gravity), ""
     places = [said(f"tbm_{where}", 3) for where in ("fr", "bl", "br", "fl")]
     if all(x is not None for x in places):
         found |= placed(np.stack(places), note="front right, back left, back right, front left")
@@ -191,8 +202,11 @@ def _l2f(said: Said) -> Found:
     places, up, torque = (None if (x := said(name, None, 3)) is None else x * turn for name in names)
     limit, kappa = said("action_limit", None), said("rotor_torque_constants", None)
     times = [said(f"rotor_time_constants_{name}", None) for name in ("rising", "falling")]
-    said.asked |= {"J_inv", "hovering_throttle_relative"}
-    found = said.fields(mass="mass") | diagonal(said("J", 3, 3)) | ({} if places is None else placed(places, up))
+    said.asked |= {"hovering_throttle_relative"}
+    inertia, inverse = said("J", 3, 3), said("J_inv", 3, 3)
+    found = said.fields(mass="mass") | diagonal(inertia) | ({} if places is None else placed(places, up))
+    if inertia is not None and inverse is not None and not np.allclose(inertia @ inverse, np.eye(3), atol=0.05):
+        found["inertia"] = None, "J_inv is not the inverse of J"
     if up is not None and torque is not None:
         found["rotor_spin"] = np.sign((up * torque).sum(-1)), ""
     if gravity is not None:
@@ -255,7 +269,8 @@ def _rotorpy(said: Said) -> Found:
         found["thrust_map"] = [k2, 0.0, 0.0], ""
         found["yaw_torque_coefficient"] = (None if torque is None else torque / k2), "k_m per k_eta"
         found |= said.given
-        add_drag(found, said("k_d"), said("k_z"))
+        sides, up = said("k_d"), said("k_z")
+        add_drag(found, None if up is None else sides, up)
     return found
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from torchrl_quad.errors import UserValueError, one_line, shown
 
 # What the name of a rotor's link says beside rotor, prop or motor, {0}: a number, or else where it is.
 _NUMBERED, _PLACED = r"{0}\D{{0,20}}\d", r"\d_?{0}|(left|right|front|rear|back).*{0}|{0}.*(left|right|front|rear|back)"
+_OTHER = "guard|arm|mount|adapter|hub|base", "guard"  # what a rotor is not called; the second where all are
 _TURNING = ("revolute", "continuous", "prismatic", "universal", "ball", "screw")  # joints
 DEPTH = 20  # of models, joints and frames within each other
 # Of each link: its mass, the frame of its centre of mass, its inertia there (NaN where nothing is said), and two
@@ -60,8 +61,8 @@ def read_xml(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
     short = {_last(name): name for name in links}
     rotors = [short.get(_last(x.findtext("linkName")), "") for x in motors]
     plain = {x: re.sub("(quad|hexa|octo|multi)_?rotor", "", x.lower()) for x in links}
-    for name, word in itertools.product((_NUMBERED, _PLACED), ("rotor", "prop", "motor")):
-        named = [x for x, said in plain.items() if re.search(name.format(word), said) and "guard" not in said]
+    for other, name, word in itertools.product(_OTHER, (_NUMBERED, _PLACED), ("rotor", "prop", "motor")):
+        named = [x for x, said in plain.items() if re.search(name.format(word), said) and not re.search(other, said)]
         rotors = rotors or sorted(named, key=_digits)
     if "" in rotors:
         raise UserValueError(f"{path}: the linkName of a motor is that of no link with an <inertial>. Add it.")
@@ -110,7 +111,9 @@ def _digits(name: str | None) -> list[int]:
 
 def _xml(path: Path) -> ET.Element:
     text = read_text(path)
-    text = text[max(text.find("<?xml"), 0) :]  # before which Gazebo allows comments
+    text = re.sub(r"{#.*?#}", "", text[max(text.find("<?xml"), 0) :], flags=re.DOTALL)  # comments of Jinja, of Gazebo
+    if chosen := re.search(r"{%-?\s*(if|for|macro|include|block)\b.*", text):
+        raise UserValueError(f"{path}: a template of Jinja, with {shown(chosen[0][:40])}. Render it first.")
     if re.match(r"\s*<(!doctype )?html", text.lower()):
         raise UserValueError(f"{path}: this is a web page. Download the file itself, which GitHub calls raw.")
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # a few lines of which can mean billions of characters
@@ -127,10 +130,10 @@ def _xml(path: Path) -> ET.Element:
     return root
 
 
-def _numbers(text: str | None, n: int, source: str) -> Array:
-    """So many numbers; zeros where there is nothing."""
+def _numbers(text: str | None, n: int, source: str, nothing: float = 0.0) -> Array:
+    """So many numbers, or as many times what stands for nothing."""
     try:
-        values = np.array((text or "").split() or [0.0] * n, float)
+        values = np.array((text or "").split() or [nothing] * n, float)
     except ValueError:
         values = np.empty(0)
     if len(values) != n:
@@ -165,15 +168,13 @@ def _add_urdf(root: ET.Element, links: Links, source: str) -> None:
             if above in joints:
                 frame, above = origin(joints[above]) @ frame, end(joints[above], "parent")
         about = {x.tag: x.attrib for x in inertial}
-        mass, *moments = (
-            _numbers(about.get(tag, {}).get(name), 1, source)[0]
-            for tag, name in (("mass", "value"), *(("inertia", f"i{axes}") for axes in AXES))
-        )
+        names = (("mass", "value"), *(("inertia", f"i{axes}") for axes in AXES))
+        said = (about.get(tag, {}).get(key) for tag, key in names)
+        mass, inertia = _inertial(said, f"{source}: the link {shown(name)}")
         axis = joints[name].find("axis") if name in joints and joints[name].get("type") != "fixed" else None
         turns = np.array([0.0, 0.0, 1.0]) if axis is None else _numbers(axis.get("xyz"), 3, source)
         turns = frame[:3, :3] @ turns / max(np.linalg.norm(turns), 1e-9)
         turns *= -1.0 if turns[2] < 0.0 else 1.0  # a rotor may turn either way about it
-        inertia = symmetric(*moments) if "inertia" in about else np.full((3, 3), np.nan)
         links[name] = mass, frame @ origin(inertial), inertia, np.stack((frame[:3, 2], turns))
 
 
@@ -220,21 +221,27 @@ def _add_sdf(
             if inertial.get("auto") in ("true", "1"):
                 why = f"Gazebo computes the inertia of the link {shown(link.get('name'))} from its shapes"
                 raise UserValueError(f'{path}: {why}. Write its <mass> and <inertia>, without auto="true".')
-            mass, *moments = (
-                _numbers(inertial.findtext(x), 1, str(path))[0] for x in ("mass", *(f"inertia/i{a}" for a in AXES))
-            )
             name, frame = link.get("name", ""), standing(link)
+            said = map(inertial.findtext, ("mass", *(f"inertia/i{axes}" for axes in AXES)))
+            mass, inertia = _inertial(said, f"{path}: the link {shown(name)}")
             if name in links:  # of another model
                 name = f"other{len(links)}::{name}"
-            inertia = symmetric(*moments) if inertial.find("inertia") is not None else np.full((3, 3), np.nan)
             links[name] = mass, frame @ own(inertial), inertia, frame[:3, [2, 2]].T
     return inside | {x: standing(names[x]) for x in names if names[x].tag in ("link", "frame")}
+
+
+def _inertial(said: Iterable[str | None], link: str) -> tuple[float, Array]:
+    """The mass of a link, and its inertia (3, 3), in which moments that are not said are NaN, and products 0."""
+    mass, *moments = (_numbers(text, 1, link, 0.0 if k > 3 else np.nan)[0] for k, text in enumerate(said))
+    if np.isnan(mass) and not np.isnan(moments[:3]).all():
+        raise UserValueError(f"{link} has an inertia without a mass. Write it, or take the <inertial> out.")
+    return np.nan_to_num(mass), symmetric(*moments)
 
 
 def _included(path: Path, uri: str) -> tuple[Path, ET.Element]:
     """The file and the model that a model includes, which lie beside it."""
     name = re.sub(r"/(model\.sdf|\d+)?$", "", uri.strip()).rsplit("/", 1)[-1]
-    beside = path.parent.parent / name
+    beside = path.absolute().parent.parent / name
     places = [beside / "model.sdf", beside / f"{name}.sdf", path.parent / f"{name}.sdf"]
     file = next((x for x in places if re.fullmatch(r"(?!\.)[\w. -]+", name) and x.is_file()), None)
     if file is None or (inner := _xml(file).find("model")) is None:
@@ -256,7 +263,7 @@ def _body(links: Links, rotors: Sequence[str], by_motors: bool) -> Found:
     found: Found = ({"mass": (mass, note)} if mass > 0.0 else {}) | diagonal(whole, note)
     points = [x for x, (m, _, inertia, _) in links.items() if np.isnan(inertia).any() and m > 0.2 * mass]
     if points:
-        found["inertia"] = None, f"the link {shown(points[0])} has a mass and no <inertia>"
+        found["inertia"] = None, f"the link {shown(points[0])} has a mass, and no ixx, iyy and izz"
     if not rotors:
         why = "relative to the centre of mass; no link with an <inertial> is named rotor, prop or motor with a number"
         return found | {"rotor_positions": (None, why)}
@@ -299,8 +306,8 @@ def _add_attributes(found: Found, said: Said, name: str) -> None:
         if torque is not None:
             found["yaw_torque_coefficient"] = torque / force, "km per kf"
         if ratio is not None and mass and places is not None:
-            found["rotor_speed_max"] = (
-                speed_at(ratio * 9.81 * mass / len(places), found["thrust_map"][0]),
-                "of thrust2weight",
-            )
+            most = speed_at(ratio * 9.81 * mass / len(places), found["thrust_map"][0])
+            found["rotor_speed_max"] = most, "of thrust2weight"
+        elif ratio is not None:
+            found["rotor_speed_max"] = None, "it follows from thrust2weight once mass and places are known"
         add_drag(found, said("drag_coeff_xy"), said("drag_coeff_z"))

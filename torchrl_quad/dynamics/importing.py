@@ -117,17 +117,24 @@ def _completed(
     source: str, kind: str, found: Found, fields: Mapping[str, Any], unread: Sequence[str], entry: str | None
 ) -> Found:
     """What a file and a user say, and what is ours; an error names all that is missing."""
+    if "rotor_positions" in fields and "rotor_direction" not in fields:
+        found = {k: x for k, x in found.items() if k != "rotor_direction"}  # of the file's places
     known, found = found | usable(fields), found | {k: (v, GIVEN) for k, v in fields.items()}
-    if missing := [name for name in ASKED if found.get(name, (None,))[0] is None]:
+    curve = found.get("thrust_map", (None,))[0]
+    asked = list(ASKED)
+    if curve is not None and np.shape(curve) == (3,) and curve[1] < 0.0 < curve[0]:  # thrust falls at first
+        asked.append("rotor_speed_min")
+    if missing := [x for x in asked if found.get(x, (None,))[0] is None]:
         why = [f": {found[x][1]}" if x in found and found[x][1] else "" for x in missing]
         names = ", ".join(f"{x} [{FIELDS[x]['unit'] or '1'}]{y}" for x, y in zip(missing, why, strict=True))
-        like = ", ".join(f"{x}={y}" for x, y in _examples(known).items() if x in missing)
+        follow = [x for x in missing if x in found and found[x][1].startswith("it follows")]
+        like = ", ".join(f"{x}={y}" for x, y in _examples(known).items() if x in missing and x not in follow)
         like = f"entry={entry!r}, {like}" if entry is not None else like
         raise UserValueError(
             f"{source} ({kind}) does not say {names}. Give your own numbers, in SI units and our frame, such as "
             f"load_drone({source!r}, {like}), or the same as arguments of recipes/import_drone.py."
         )
-    drags = [one_line(x) for x in unread if re.search("drag|aero", x)]
+    drags = [one_line(x) for x in unread if re.search("drag|aero", x) and "linear" not in x]
     ours = {
         "rotor_speed_min": (0.0, "assumed: rotors may stop"),
         "quadratic_drag": ([0.0] * 3, f"left out: {', '.join(drags)}" if drags else "not in the file"),
@@ -169,6 +176,8 @@ def _examples(found: Found) -> dict[str, str]:
     most = ASKED["rotor_speed_max"] if curve is None else f"{speed_at(force, curve):.4g}"
     thrust = f"[{force / max(fast, 1.0) ** 2:.2g}, 0, 0]"
     examples = ASKED | {"rotor_spin": spin, "thrust_map": thrust, "rotor_speed_max": most}
+    if curve is not None:
+        examples["rotor_speed_min"] = f"{-0.55 * curve[1] / curve[0]:.3g}"  # a tenth beyond the lowest thrust
     examples["linear_drag"] = str([float(f"{0.3 * heavy:.2g}")] * 3)
     return {name: example.replace(" ", "") for name, example in examples.items()}  # one word of a command line
 
@@ -199,7 +208,8 @@ def _read(drone: Any, entry: str | None, fields: Mapping[str, Any]) -> tuple[str
     if (entry is None and len(drones) > 1) or (entry is not None and entry not in drones):
         names = f"entry={next(iter(drones))!r} or another of {shown(list(drones))}"
         raise UserValueError(f"{source}: choose one drone of the file, by {names}; got {shown(entry)}.")
-    own = set(FIELDS) & set(data) if isinstance(data, Mapping) else set()  # others, too, say "mass"
+    own = set(FIELDS) & set(data) if isinstance(data, Mapping) else set()
+    own = own if own - {"mass", "inertia", "gravity"} or (own and own == set(data)) else set()  # others, too, say these
     parts = [data, *data.values()] if isinstance(data, Mapping) else []
     if any(isinstance(part, Mapping) and "rpy_coef" in part for part in parts):
         raise UserValueError(

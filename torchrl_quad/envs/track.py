@@ -191,7 +191,7 @@ def load_track(track: str | Path | Mapping = "visfly", **settings: Any) -> dict[
     """
     source, values = _read(track, settings)
     values = own_format(source, values)
-    for key in values.keys() - set(_PARTS):
+    for key in (key for key in values if key not in _PARTS):
         raise UserValueError(f"{source}: unknown key {shown(key)}. Allowed: {', '.join(_PARTS)}.")
     found = {key: check_value(f"{source}: {key}", values[key], *_KEYS[key]) for key in _KEYS if key in values}
     found |= {key: values[key] for key in ("scene", "notes") if key in values}

@@ -19,8 +19,9 @@ BELOW = 4.0  # [m], from the lowest gate down to the end of the box, where gates
 _YAWS = {"x": 0.0, "y": 0.5 * math.pi, "-x": math.pi, "-y": -0.5 * math.pi}
 AXES = {name: from_euler(np.array([0.0, 0.0, yaw])) for name, yaw in _YAWS.items()}  # what turns the x axis there
 # Of lsy_drone_racing, in the comments of its files: "0.72m wide (outer dimensions of the frame) with a 0.4m wide
-# opening", and obstacles are "cylinders with a diameter of 0.03m", whose position is that of their top.
-LSY_OPENING, LSY_FRAME, LSY_POLE = 0.4, 0.16, 0.015
+# opening", and obstacles are "cylinders with a diameter of 0.03m", whose position is that of their top. In its first
+# versions the bars of gates are 0.09 m wide, and gates are flown along y.
+LSY_OPENING, LSY_FRAMES, LSY_POLE = 0.4, {"x": 0.16, "y": 0.09}, 0.015
 LSY_RUN_UP = 0.25  # [m], from a start to its gate, before which poles stand
 
 
@@ -61,29 +62,14 @@ def own_format(source: str, values: Mapping[str, Any]) -> dict[str, Any]:
 def agile_flight(source: str, values: dict[str, Any], gates: list[Mapping[str, Any]]) -> dict[str, Any]:
     """Of uzh-rpg/agile_flight: gates by name, the drone's start, and the goal. ``scale`` has no unit, and is not read.
 
-    The axis of gates along which they are flown differs from file to file. It is the one along which each gate is
-    flown in the order of the gates, on the ways to it and from it together.
+    The axis of gates along which they are flown differs from file to file.
     """
     centres, rotations = (as_array([gate[key] for gate in gates]) for key in ("position", "rotation"))
     if missing := [key for key in ("start_pos", "goal_pos") if key not in values]:
         raise UserValueError(f"{source}: does not say {missing[0]}. Give load_track(..., {missing[0]}=[x, y, z]).")
     start, goal = as_array(values["start_pos"]), as_array(values["goal_pos"])
     is_lap = np.linalg.norm(goal - centres[0]) < np.linalg.norm(goal - centres[-1])
-    path = np.vstack((start, centres, centres[:1] if is_lap else centres[-1:]))
-    ways = np.diff(path, axis=0)
-    ways /= np.linalg.norm(ways, axis=1, keepdims=True).clip(1e-9)
-    axis = values.get("axis")
-    if axis is None:
-        flown = {name: rotate(multiply(rotations, turn), [1.0, 0.0, 0.0]) for name, turn in AXES.items()}
-        fit = [name for name, along in flown.items() if ((ways[:-1] + ways[1:]) * along).sum(1).min() > 1e-3]
-        if len(fit) != 1:
-            raise UserValueError(
-                f"{source}: its gates are flown along one of their axes, and their order does not show which. Give "
-                f'axis="x", "-x", "y" or "-y". Rotations are read as w, x, y, z.'
-            )
-        (axis,) = fit
-    elif axis not in AXES:
-        raise UserValueError(f"{source}: axis must be one of {', '.join(AXES)}; got {shown(axis)}.")
+    axis = _axis(source, values.get("axis"), start, centres, rotations, is_lap)
     notes = [
         f"gates are flown along their {axis} axis",
         "a lap: the goal is nearer to the first gate" if is_lap else "no lap: the goal is nearer to the last gate",
@@ -96,6 +82,23 @@ def agile_flight(source: str, values: dict[str, Any], gates: list[Mapping[str, A
     own = {key: x for key, x in values.items() if key not in ("start_pos", "goal_pos", "render_offset", "axis")}
     found = {**floor, "closed": bool(is_lap), "start": start.tolist(), **own}
     return {**found, "gates": posed(centres, turned), "notes": notes}
+
+
+def _axis(source: str, axis: Any, start: Any, centres: Any, rotations: Any, is_lap: Any, known: Any = AXES) -> str:
+    """The axis of gates along which each is flown in their order, on the ways to it and from it together."""
+    path = np.vstack((start, centres, centres[:1] if is_lap else centres[-1:]))
+    ways = np.diff(path, axis=0)
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True).clip(1e-9)
+    flown = {name: rotate(multiply(rotations, AXES[name]), [1.0, 0.0, 0.0]) for name in known}
+    fit = [name for name, along in flown.items() if ((ways[:-1] + ways[1:]) * along).sum(1).min() > 1e-3]
+    if axis is None and len(fit) != 1:
+        raise UserValueError(
+            f"{source}: its gates are flown along one of their axes, and their order does not show which. Give axis="
+            f"{' or '.join(map(repr, known))}. Rotations are read as w, x, y, z, or as roll, pitch and yaw."
+        )
+    if axis is not None and axis not in known:
+        raise UserValueError(f"{source}: axis must be one of {', '.join(known)}; got {shown(axis)}.")
+    return axis or fit[0]
 
 
 def time_optimal(source: str, values: dict[str, Any]) -> dict[str, Any]:
@@ -116,10 +119,13 @@ def time_optimal(source: str, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
-    """Of utiasDSL/lsy_drone_racing: square gates, flown along their x axis, poles, and how both are drawn."""
+    """Of utiasDSL/lsy_drone_racing: gates, flown along their x axis, in the first versions along y; poles; and how both
+    are drawn."""
     track = values["env"]["track"]
-    centres = as_array([gate["pos"] for gate in track["gates"]])
+    centres, angles = (as_array([gate[name] for gate in track["gates"]]) for name in ("pos", "rpy"))
     drones = track["drones"] if "drones" in track else [track["drone"]]  # in the first versions
+    if not len(centres) or abs(angles).max() > 2.0 * math.pi:
+        raise UserValueError(f"{source}: needs gates, whose rpy is in radians; got {shown(angles.tolist())}.")
     start, limits = as_array(drones[0]["pos"]).tolist(), track.get("safety_limits")
     if limits is None and "box" not in values:
         raise UserValueError(
@@ -127,22 +133,28 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
         )
     box = values.get("box") or [limits["pos_limit_low"], limits["pos_limit_high"]]
     box = as_array(box).tolist()
-    own = {key: x for key, x in values.items() if key not in ("controller", "deploy", "sim", "env")}
-    own = {"width": LSY_OPENING, "height": LSY_OPENING, "frame": LSY_FRAME, "closed": False, "box": box, **own}
-    notes = [
-        "gates are open 0.4 m, with frames of 0.16 m; poles are 0.03 m thick, and end at their position",
-        "the drone hovers above its start; drone, sensors and disturbances are not read",
-    ]
-    own |= {"start_range": 0.05, "floor": box[0][2], "notes": notes}
-    if len(drones) > 1:
-        notes.append(f"{len(drones)} drones race there: the first is read")
+    own = {key: x for key, x in values.items() if key not in ("controller", "deploy", "sim", "env", "axis")}
     order = track.get("gate_order") or [*range(1, len(centres) + 1)]
     gates = [abs(x) - 1 for x in order]
     if any(x not in range(len(centres)) for x in gates):
         raise UserValueError(f"{source}: gate_order names gates from 1 to {len(centres)}; got {shown(order)}.")
-    centres, rotations = centres[gates], from_euler(as_array([gate["rpy"] for gate in track["gates"]]))[gates]
+    centres, rotations = centres[gates], from_euler(angles)[gates]
     back = from_euler(np.array([0.0, 0.0, math.pi]))  # a negative number is a gate that is flown backwards
     rotations = np.where(np.array(order)[:, None] < 0, multiply(rotations, back), rotations)
+    of_today = limits is not None or "gate_order" in track
+    axis = values.get("axis") or ("x" if of_today else None)
+    axis = _axis(source, axis, start, centres, rotations, False, LSY_FRAMES)
+    rotations, size = multiply(rotations, AXES[axis]), track.get("gate_size") or {}
+    own = {"width": size.get("width", LSY_OPENING), "height": size.get("height", LSY_OPENING), **own}
+    own = {"frame": LSY_FRAMES[axis], "closed": False, "box": box, "start_range": 0.05, "floor": box[0][2], **own}
+    notes = [
+        f"gates are flown along their {axis} axis",
+        f"they are open {own['width']:g} x {own['height']:g} m, with frames of {own['frame']:g} m",
+        "poles are 0.03 m thick, and end at their position",
+        "the drone hovers above its start; drone, sensors and disturbances are not read",
+    ]
+    notes += [f"{len(drones)} drones race there: the first is read"] if len(drones) > 1 else []
+    own["notes"] = notes
     if track.get("randomize", False) or "random" in values:  # of positions it says nothing but the limits
         low, high = box
         reach = min(high[i] - low[i] for i in (0, 1)) / 2.0

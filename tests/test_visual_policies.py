@@ -235,7 +235,7 @@ def test_correlated_noise_of_a_policy_that_sees_is_that_of_its_head(recurrent):
     with set_exploration_type(MODE):  # also after a random flight
         modes = [policy(start.copy().set("noise", torch.ones(3, 4))) for policy in (actor, white)]
     torch.testing.assert_close(modes[0]["action"], modes[1]["action"])
-    assert actor.parts().size == 4
+    assert actor.plain().size == 4
 
 
 def test_what_cannot_be_seen_is_refused():

@@ -16,8 +16,6 @@ from torchrl_quad.data.transforms import PolicyUnder
 from torchrl_quad.deploy.network import ACTIVATIONS, Layer, Memory, Network
 from torchrl_quad.errors import UserValueError
 
-GRU = ("weight_ih_l0", "bias_ih_l0", "weight_hh_l0", "bias_hh_l0")  # torch's names, in the order of Memory
-
 
 def fold(
     actor: TensorDictModuleBase, normalizer: ObservationNormalizer | None = None, image: Sequence[int] | None = None
@@ -28,47 +26,37 @@ def fold(
     another function has built, or that reads what a drone cannot give it.
     """
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        plain, parts = (
-            getattr(actor, name)() if hasattr(actor, name) and not isinstance(actor, PolicyUnder) else None
-            for name in ("plain", "parts")
-        )
-    if parts is not None:
-        network = _composed(actor, parts, normalizer, image)
-    elif plain is not None:
-        _check_ends(plain.in_keys, ["observation"], plain.low, plain.high)
-        linear = zip(plain.weights[::2], plain.weights[1::2], [*plain.activations, nn.Tanh()], strict=True)
-        layers = _layers(linear, plain.size, np.repeat(plain.scales, plain.widths), normalizer)
-        network = Network(layers, max_loc=plain.head.max_loc)
-    else:
+        make = None if isinstance(actor, PolicyUnder) else getattr(actor, "plain", None)
+        plain: Any = make() if callable(make) else None
+    if not hasattr(plain, "lenses"):  # what somebody else has written may have a plain form, too
         raise UserValueError(
             "export_policy exports what make_actor and make_visual_actor build, with its parts unchanged and without "
             f"hooks: tanh-Gaussian policies. This {type(actor).__name__} is something else; build the policy with "
             "make_actor(env, ...) or make_visual_actor(env, ...), and load your weights into it."
         )
+    read = [key for key in plain.in_keys if key not in plain.memory]
+    if read != ["depth"] * plain.sees + ["observation"]:
+        raise UserValueError(
+            f'export_policy: the policy reads {read}. A drone only has the "observation": train it with '
+            'in_keys=[\'observation\']. A visual policy may also read "depth", with image_key="depth".'
+        )
+    if plain.low is not None:
+        raise UserValueError(f"export_policy: actions must lie from -1 to 1, got {plain.low} to {plain.high}.")
+    *layers, last = zip(plain.weights[::2], plain.weights[1::2], strict=True)
+    activations, count = [*plain.lenses, *plain.activations], len(plain.lenses)
+    activated = [(*layer, activation) for layer, activation in zip(layers, activations, strict=False)]
+    seen = _layers(activated[:count]) if plain.sees else []
+    memory = Memory(*(_numbers(x).astype(np.float32) for x in plain.weights[-6:-2])) if plain.memory else None
+    height, width = image or (0, 0)
+    network = Network([], seen, (height, width), plain.nearest, memory, plain.head.max_loc)
+    if seen and (image is None or network.features != plain.widths[0] or seen[0].weight.shape[1] != 1):
+        camera = "has no camera" if image is None else f"shows it {image[1]} x {image[0]} pixels"
+        raise UserValueError(f"export_policy: the policy is for images of another size; the environment {camera}.")
+    columns, own = np.repeat(plain.scales, plain.widths), [*activated[count:], (*last, nn.Tanh())]
+    network = network._replace(layers=_layers(own, plain.size, columns, normalizer))
     if not all(np.isfinite(x).all() for x in network.weights()):
         raise UserValueError("export_policy: the weights of the policy, or its normaliser, are not finite.")
     return network
-
-
-def _composed(actor: Any, parts: Any, normalizer: ObservationNormalizer | None, image: Sequence[int] | None) -> Network:
-    """The network of a policy with eyes or memory, from the parts that it names."""
-    bounds, sees = actor[1].distribution_kwargs, bool(parts.convolutions)
-    known = ["depth", "observation"] if sees else ["observation"]
-    _check_ends([*actor[0][0].in_keys], known, bounds.get("low"), bounds.get("high"))
-    convolutions, trunk = (
-        [(layer.weight, layer.bias, activation) for layer, activation in zip(x[::2], x[1::2], strict=True)]
-        for x in (parts.convolutions, parts.trunk)
-    )
-    memory = parts.memory and Memory(*(_numbers(getattr(parts.memory, name)).astype(np.float32) for name in GRU))
-    height, width = image or (0, 0)
-    seen = _layers(convolutions) if sees else []
-    network = Network([], seen, (height, width), parts.nearest, memory, parts.max_loc)
-    if sees and (image is None or network.features != parts.widths[0] or network.convolutions[0].weight.shape[1] != 1):
-        camera = "has no camera" if image is None else f"shows it {image[1]} x {image[0]} pixels"
-        raise UserValueError(f"export_policy: the policy is for images of another size; the environment {camera}.")
-    last = parts.head.weight, parts.head.bias, nn.Tanh()
-    layers = _layers([*trunk, last], parts.size, np.repeat(parts.scales, parts.widths), normalizer)
-    return network._replace(layers=layers)
 
 
 def _layers(
@@ -98,16 +86,6 @@ def _layers(
     names = [type(activation).__name__ for activation in activations]
     weights, biases = ([x.astype(np.float32) for x in values] for values in (weights, biases))
     return [Layer(*parts) for parts in zip(weights, biases, names, strict=True)]
-
-
-def _check_ends(found: Sequence[Any], known: list[str], low: Any, high: Any) -> None:
-    if found != known:
-        raise UserValueError(
-            f'export_policy: the policy reads {found}. A drone only has the "observation": train it with '
-            'in_keys=[\'observation\']. A visual policy may also read "depth", with image_key="depth".'
-        )
-    if low is not None:
-        raise UserValueError(f"export_policy: actions must lie from -1 to 1, got {low} to {high}.")
 
 
 def _numbers(x: Tensor) -> NDArray[np.float64]:

@@ -2,40 +2,37 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Hashable, Sequence
-from typing import Annotated, Any, NamedTuple, cast
+import math
+from collections.abc import Sequence
+from typing import Annotated, Any, TypeVar, cast
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, dispatch
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.nn import TensorDictModule, TensorDictSequential, dispatch
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torch.func import vjp
-from torchrl.data import Unbounded
+from torchrl.data import Bounded, Unbounded
 from torchrl.envs import EnvBase, TensorDictPrimer
-from torchrl.modules import MLP, ConvNet, GRUModule, ProbabilisticActor, set_recurrent_mode
-from torchrl.modules.tensordict_module.rnn import GRU
+from torchrl.envs.utils import ExplorationType, exploration_type
+from torchrl.modules import MLP, ConvNet, GRUModule, ProbabilisticActor, TanhNormal, set_recurrent_mode
 
 from torchrl_quad.data.unwrap import check_env, leaf, observed
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.modules.networks import OBSERVATION, Activation, Cells, ScaleInit, first_action, network_of, policy_of
+from torchrl_quad.modules.networks import OBSERVATION, Activation, Cells, ScaleInit, first_action, network_of
 from torchrl_quad.modules.plain import (
+    MEMORY,
+    NEAREST,
+    GaussianHead,
     Network,
     PlainTanhGaussian,
-    Recall,
-    TanhGaussianActor,
-    concatenated,
-    gates_of,
-    gradient_before,
+    first_noise,
     is_pointwise,
     layout,
-    recalled_by,
+    tanh_gaussian,
 )
 from torchrl_quad.options import Below1, Entries, Entry, Field, Scale, Width, checked
 
-MEMORY = "recurrent_state"
-NEAREST = 0.3  # [m]; closer depths are clamped
+_Actor = TypeVar("_Actor", bound="TanhGaussianActor")
 
 
 @checked
@@ -205,6 +202,48 @@ def _composed(
     return policy_of(ComposedActor, parts, last, read, spec, first, *options)
 
 
+def policy_of(
+    cls: type[_Actor],
+    parts: Sequence[Any],
+    network: Network,
+    in_keys: Sequence[NestedKey],
+    spec: Bounded,
+    first: Tensor,
+    scale_init: float,
+    rho: float,
+    return_log_prob: bool,
+) -> _Actor:
+    """A tanh-Gaussian policy of some parts and a last network, which reads ``in_keys``.
+
+    It begins with actions of mean ``first`` (k), before the tanh, whatever it reads.
+    """
+    layer = cast(nn.Linear, network.mlp[-1])
+    with torch.no_grad():
+        layer.weight.mul_(0.01)
+        layer.bias.zero_()
+        layer.bias[: len(first)] = first
+    least = min(0.01, 0.1 * scale_init)  # to which training can bring the scale down
+    max_loc = 5.0 if return_log_prob else math.inf  # as far as TorchRL's TanhNormal goes with tanh_loc=True
+    network.head = GaussianHead(len(first), f"biased_softplus_{scale_init}_{least}", max_loc, rho)
+    read = [*in_keys, "noise_before"] if rho else list(in_keys)
+    last = TensorDictModule(network, in_keys=read, out_keys=["loc", "scale"])
+    low, high = spec.low, spec.high
+    # Of what the parts hand on to each other only the memory is kept.
+    written = ["loc", "scale", *(key for part in parts for key in part.out_keys if key[0] == "next")]
+    actor = cls(
+        TensorDictSequential([*parts, last], selected_out_keys=written) if parts else last,
+        in_keys=["loc", "scale"],
+        spec=spec,
+        distribution_class=TanhNormal,
+        distribution_kwargs={} if (low == -1).all() and (high == 1).all() else {"low": low, "high": high},
+        return_log_prob=return_log_prob,
+    )
+    if rho:
+        actor.out_keys = [*actor.out_keys, "noise_before", "noise"]
+    actor.built = layout(actor)
+    return actor
+
+
 class Features(nn.Module):
     """Features (*, k) of vectors, and of an image where there are convolutions, whose output the trunk reads, too."""
 
@@ -220,18 +259,70 @@ class Features(nn.Module):
         return self.activation(self.trunk(*inputs))
 
 
-class Parts(NamedTuple):
-    """What a policy with eyes or memory is made of, in the order in which it computes."""
+class TanhGaussianActor(ProbabilisticActor):
+    """What :func:`~torchrl_quad.make_actor` builds: a tanh-Gaussian policy that environments can fly as pure functions.
 
-    convolutions: list[nn.Module]  #: each followed by its activation; none if it is blind
-    nearest: float  #: [m]; they read 1 / max(depth, nearest)
-    trunk: list[nn.Module]  #: linear layers, each followed by its activation; the first reads images, then vectors
-    widths: tuple[int, ...]  #: of the output of the convolutions, and of the vectors
-    scales: tuple[float, ...]  #: by which these are multiplied
-    memory: GRU | None  #: reads what the trunk returns
-    head: nn.Linear  #: reads what trunk and memory return; its first outputs are the mean action before the tanh
-    size: int  #: of the action
-    max_loc: float  #: the largest mean action before the tanh
+    With noise that is correlated in time it writes ``noise``, which a flight hands on, and ``noise_before``, that of
+    the step before. If there is none yet it is drawn. A deterministic flight has none.
+    """
+
+    built: list[Any]  # its layout
+
+    @property
+    def last(self) -> Network:
+        """The network that ends in the head."""
+        parts: Any = self[0]
+        return cast(Network, (parts[-1] if isinstance(parts, TensorDictSequential) else parts).module)
+
+    @property
+    def sampler(self) -> Any:
+        """The part that samples."""
+        return self[1]
+
+    @property
+    def is_random(self) -> bool | None:
+        """Whether it samples, or takes the mode; None if it is asked for something else."""
+        kind = exploration_type() or self.sampler.default_interaction_type
+        return {ExplorationType.RANDOM: True, ExplorationType.DETERMINISTIC: False}.get(kind)
+
+    @property
+    def log_prob_entry(self) -> NestedKey | None:
+        """The entry of the log-probability, if it is wanted."""
+        return self.sampler.log_prob_key if self.sampler.return_log_prob else None
+
+    @property
+    def bounds(self) -> tuple[Tensor, Tensor] | None:
+        """The least and the greatest action, each (k); None for -1 and 1."""
+        bounds = self.sampler.distribution_kwargs
+        return (bounds["low"], bounds["high"]) if bounds else None
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
+        """Write loc, scale and action, the noise if it is correlated, and the log-probability if wanted."""
+        head = getattr(self.last, "head", None)
+        if not isinstance(head, GaussianHead) or not head.rho:
+            return super().forward(tensordict, **kwargs)
+        is_random, before = self.is_random, tensordict.get("noise", None)
+        if before is None or not is_random:
+            last = cast(nn.Linear, self.last.mlp[-1])
+            before = first_noise(last.weight.new_zeros((*tensordict.batch_size, head.size)), is_random)
+        tensordict.set("noise_before", before)
+        if is_random is None:
+            return super().forward(tensordict, **kwargs).set("noise", before)
+        # Evaluated for each of the two, which fixes the order in which gradients add up.
+        loc, scale = (leaf(self[0](tensordict), key) for key in ("loc", "scale"))
+        xi = first_noise(torch.zeros_like(loc.detach()), is_random)
+        written = tanh_gaussian(loc, scale, xi, self.bounds, self.log_prob_entry)
+        return tensordict.update(written).set("noise", head.next(before, xi))
+
+    def plain(self) -> PlainTanhGaussian | None:
+        """The policy as pure functions of its present weights; None if its parts were changed or hooked."""
+        if type(self) is not TanhGaussianActor or self.is_random is None or layout(self) != self.built:
+            return None
+        network, keys = self.last, list(self[0].in_keys)
+        if len(set(map(str, keys))) < len(keys) or not network.is_plain:  # one that reads an entry twice is called
+            return None
+        return PlainTanhGaussian(self, keys[: len(network.scales)], network, list(network.mlp)[:-1])
 
 
 class ComposedActor(TanhGaussianActor):
@@ -248,34 +339,21 @@ class ComposedActor(TanhGaussianActor):
             )
         return super().forward(tensordict, **kwargs)
 
-    def plain(self) -> PlainParts | None:
+    def plain(self) -> PlainTanhGaussian | None:
         """The policy as pure functions of its present weights; None if its parts were changed or hooked."""
-        parts = self.parts()
-        return None if parts is None else PlainParts(self, parts)
+        if layout(self) != self.built or self.is_random is None:
+            return None
+        first, *memory, _ = cast(Any, self[0].module)
+        features = first.module
+        if not features.trunk.is_plain or not is_pointwise(features.activation):
+            return None
+        trunk, convolutions = [*features.trunk.mlp, features.activation], list(features.convolutions or ())[:-1]
+        gru = memory[0].gru if memory else None
+        return PlainTanhGaussian(self, first.in_keys, features.trunk, trunk, convolutions, gru)
 
     def replayed(self) -> Replay | None:
         """The policy as losses let it act again in a whole rollout, or None if it explores in another way."""
         return None if self.is_random is None else Replay(self)
-
-    def parts(self) -> Parts | None:
-        """The parts as they were built; None if they were changed or hooked."""
-        if layout(self) != self.built or self.is_random is None:
-            return None
-        first, *memory, last = cast(Any, self[0].module)
-        features, head = first.module, last.module.head
-        if not features.trunk.is_plain or not is_pointwise(features.activation):
-            return None
-        return Parts(
-            list(features.convolutions)[:-1] if features.convolutions else [],
-            NEAREST,
-            [*features.trunk.mlp, features.activation],
-            features.trunk.widths,
-            features.trunk.scales,
-            memory[0].gru if memory else None,
-            last.module.mlp[0],
-            head.size,
-            head.max_loc,
-        )
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """TorchRL's transform that gives an environment the memory of this policy, in its precision."""
@@ -285,143 +363,6 @@ class ComposedActor(TanhGaussianActor):
                 spec = Unbounded(torch.Size((1, weight.shape[-1])), dtype=weight.dtype, device=weight.device)
                 return TensorDictPrimer({MEMORY: spec}, expand_specs=True)
         raise UserValueError("This policy has no memory: it was built with recurrent=False, and needs no primer.")
-
-
-class PlainParts(PlainTanhGaussian):
-    """A policy with eyes, with memory or with both on plain tensors; see the engine's ``PlainPolicy``.
-
-    The image has no gradient where ``without_gradient`` names it.
-    """
-
-    def __init__(self, actor: ComposedActor, parts: Parts) -> None:
-        first, *_ = cast(Any, actor[0].module)
-        self.is_random, self.scales, self.widths = actor.is_random, parts.scales, parts.widths
-        self.lenses, self.activations, self.nearest = parts.convolutions[1::2], parts.trunk[1::2], parts.nearest
-        self.sees, gru = bool(parts.convolutions), cast(Any, parts.memory)
-        self.memory = {MEMORY: (1, gru.hidden_size)} if gru else {}
-        self.in_keys, self.out_keys = [*map(unravel_key, first.in_keys), *self.memory], list(actor.out_keys)
-        self._take_head(actor)
-        before = [(x.weight, x.bias) for x in cast(Any, [*parts.convolutions[::2], *parts.trunk[::2]])]
-        gates = [(gru.weight_ih_l0, gru.bias_ih_l0), (gru.weight_hh_l0, gru.bias_hh_l0)] if gru else []
-        self.weights = tuple(x for pair in (*before, *gates, (parts.head.weight, parts.head.bias)) for x in pair)
-
-    @functools.cached_property
-    def signature(self) -> Hashable:
-        """What it computes."""
-        return (*self._describe(), str((self.lenses, self.activations, self.nearest, list(self.memory))))
-
-    def fits(self, inputs: Sequence[Tensor]) -> bool:
-        """Whether the network can read inputs of this width, precision and device."""
-        like, vectors = self.weights[0], inputs[self.sees : len(inputs) - len(self.memory)]
-        fits = [x.shape[-1] for x in vectors] == list(self.widths[self.sees :])
-        return fits and all((x.dtype, x.device) == (like.dtype, like.device) for x in inputs)
-
-    def forward(
-        self, weights: Sequence[Tensor], inputs: Sequence[Tensor], drawn: Tensor
-    ) -> tuple[list[Tensor], dict[NestedKey, Tensor]]:
-        """What was seen, and what each layer returns before its activation; and all that the policy writes."""
-        seen, layers = self._see(weights, inputs), self._layers_of(weights)
-        x, kept = self._read(inputs, seen), []
-        for (weight, bias), activation in zip(layers, self.activations, strict=False):
-            kept.append(torch.addmm(bias, x, weight.t()))
-            x = activation(kept[-1])
-        written: dict[NestedKey, Tensor] = {}
-        if self.memory:
-            h = inputs[-1].squeeze(-2)
-            gates, new, own_new = gates_of(torch.addmm(layers[-3][1], x, layers[-3][0].t()), h, *layers[-2])
-            kept += [gates, new, own_new]
-            recalled = recalled_by(gates, new, h)
-            written["next", MEMORY] = recalled.unsqueeze(-2)
-            x = torch.cat((x, recalled), 1)
-        kept.append(torch.addmm(layers[-1][1], x, layers[-1][0].t()))
-        written |= self._sample(kept[-1], drawn)
-        return [*seen, *kept], {key: written[key] for key in self.out_keys}
-
-    def adjoint(
-        self,
-        weights: Sequence[Tensor],
-        inputs: Sequence[Tensor],
-        kept: Sequence[Tensor],
-        drawn: Tensor,
-        grads: dict[NestedKey, Tensor],
-    ) -> tuple[list[Tensor], list[Tensor], Tensor]:
-        """What each layer read, and the gradient of what it returned; the gradients of inputs and noise."""
-        layers, seen, kept = self._layers_of(weights), kept[: self.sees], kept[self.sees :]
-        own = {key: grads[key] for key in self.out_keys if key != ("next", MEMORY)}
-        grad, grad_drawn = vjp(self._sample, kept[-1], drawn)[1](own)
-        activated = [vjp(activation, x)[:2] for activation, x in zip(self.activations, kept, strict=False)]
-        x, of_x = activated[-1][0], grad @ layers[-1][0]
-        read, of_kept, of_inputs = [x], [grad], []
-        if self.memory:
-            h, (gates, new, own_new) = inputs[-1].squeeze(-2), kept[-4:-1]
-            of_x, of_recalled = of_x.split([x.shape[1], h.shape[1]], 1)
-            of_recalled = of_recalled + grads["next", MEMORY].squeeze(-2)
-            of_gates, of_own_new, of_h = gradient_before(of_recalled, h, gates, new, own_new, layers[-2][0])
-            read, of_kept = [x, h, recalled_by(gates, new, h)], [of_gates, of_own_new, grad]
-            of_x = of_x + of_gates @ layers[-3][0]
-            of_inputs = [of_h.unsqueeze(-2)]
-        before = [self._read(inputs, seen), *(x for x, _ in activated)]
-        for i in reversed(range(len(activated))):
-            (grad,) = activated[i][1](of_x)
-            read, of_kept, of_x = [before[i], *read], [grad, *of_kept], grad @ layers[i][0]
-        of_read = [g * scale for g, scale in zip(of_x.split(list(self.widths), 1), self.scales, strict=True)]
-        if not self.sees:
-            return [*read, *of_kept], [*of_read, *of_inputs], grad_drawn
-        image, of_seen = inputs[0], of_read[0]
-        of_read[0] = torch.zeros_like(image)
-        if self.in_keys[0] not in self.without_gradient:
-            (of_read[0],) = vjp(lambda image: self._see(weights, [image])[0], image)[1](of_seen)
-        return [image, of_seen, *read, *of_kept], [*of_read, *of_inputs], grad_drawn
-
-    def recall(self, tensordict: TensorDictBase, horizon: int) -> tuple[Tensor, Tensor]:
-        """loc and scale (n horizon, k) in the states of a rollout, with gradients in the weights alone."""
-        keys = [*self.in_keys, *(["is_init"] if self.memory else []), *(["noise_before"] if self.rho else [])]
-        entries = {key: leaf(tensordict, key).detach().flatten(0, tensordict.ndim - 1) for key in keys}
-        inputs, layers = [entries[key] for key in self.in_keys], self._layers_of(self.weights)
-        x = self._read(inputs, self._see(self.weights, inputs))
-        for (weight, bias), activation in zip(layers, self.activations, strict=False):
-            x = activation(torch.addmm(bias, x, weight.t()))
-        if self.memory:
-            read = torch.addmm(layers[-3][1], x, layers[-3][0].t())
-            read, lasts = (y.unflatten(0, (-1, horizon)).transpose(0, 1) for y in (read, ~entries["is_init"]))
-            start = inputs[-1].squeeze(-2).unflatten(0, (-1, horizon))[:, 0]
-            recalled = Recall.apply(read, start, lasts.to(read), *layers[-2])
-            x = torch.cat((x, cast(Tensor, recalled).transpose(0, 1).flatten(0, 1)), 1)
-        raw = torch.addmm(layers[-1][1], x, layers[-1][0].t())
-        return self.head(raw, *(entries[key] for key in keys if key == "noise_before"))
-
-    def weight_gradient(self, weights: Sequence[Tensor], traces: Sequence[Tensor]) -> list[Tensor]:
-        """The gradients of all weights, over a batch."""
-        seen: tuple[Tensor, ...] = ()
-        if self.sees:
-            (image, of_seen, *traces), count = traces, 2 * len(self.lenses)
-            seen = vjp(lambda *own: self._see(own, [image])[0], *weights[:count])[1](of_seen)
-        found = super().weight_gradient(weights, traces)
-        if self.memory:  # whose own layer has the first gradients of the other's, and whose head reads x as well
-            x, h = traces[len(traces) // 2 - 3 :][:2]
-            of_gates, _, grad = traces[-3:]
-            size, (of_bias, own, own_bias, head, bias) = 2 * h.shape[1], found[-5:]
-            own = torch.cat((of_gates[:, :size].t() @ h, own))
-            found[-4:] = own, torch.cat((of_bias[:size], own_bias)), torch.cat((grad.t() @ x, head), 1), bias
-        return [*seen, *found]
-
-    def _layers_of(self, weights: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
-        """Weight and bias of each layer after the convolutions."""
-        own = weights[2 * len(self.lenses) :]
-        return list(zip(own[::2], own[1::2], strict=True))
-
-    def _see(self, weights: Sequence[Tensor], inputs: Sequence[Tensor]) -> list[Tensor]:
-        """What the convolutions return of a depth image (n, channels, height, width) [m], (n, k); nothing if blind."""
-        if not self.sees:
-            return []
-        x = inputs[0].clamp_min(self.nearest).reciprocal()
-        for weight, bias, activation in zip(weights[::2], weights[1::2], self.lenses, strict=False):
-            x = activation(nn.functional.conv2d(x, weight, bias, stride=2, padding=1))
-        return [x.flatten(1)]
-
-    def _read(self, inputs: Sequence[Tensor], seen: Sequence[Tensor]) -> Tensor:
-        """What the first layer reads."""
-        return concatenated([*seen, *inputs[self.sees : len(inputs) - len(self.memory)]], self.scales)
 
 
 class Replay(PlainTanhGaussian):
@@ -436,10 +377,9 @@ class Replay(PlainTanhGaussian):
 
         Single steps (n) that are no rollout are each remembered as they were flown.
         """
-        has_time = tensordict.ndim > 1 or tensordict.names[-1] == "time"
         if (plain := self.actor.plain()) is not None and not torch._C._are_functorch_transforms_active():
-            loc, scale = plain.recall(tensordict, tensordict.shape[-1] if has_time else 1)
-            return loc.view(*tensordict.shape, -1), scale.view(*tensordict.shape, -1)
+            return plain.distribution(tensordict)
+        has_time = tensordict.ndim > 1 or tensordict.names[-1] == "time"
         with set_recurrent_mode(has_time):
             read = cast(TensorDictBase, self.actor.get_dist_params(tensordict.select(*self.actor.in_keys).detach()))
         return leaf(read, "loc"), leaf(read, "scale")

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import itertools
-import math
-from collections.abc import Sequence
-from typing import Annotated, Any, TypeVar, cast
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, cast
 
 import torch
-from tensordict.nn import TensorDictModule, TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.envs.batched_envs import BatchedEnvBase
-from torchrl.modules import MLP, TanhNormal, ValueOperator
+from torchrl.modules import MLP, ValueOperator
 
 from torchrl_quad.data.unwrap import base_env, check_env, observed
 from torchrl_quad.errors import UserValueError, shown
-from torchrl_quad.modules.plain import Critic, GaussianHead, Network, TanhGaussianActor, layout
+from torchrl_quad.modules.plain import Network, layout
 from torchrl_quad.options import AfterValidator, Entries, Field, Scale, Width, checked
 
 OBSERVATION = ("observation",)
@@ -36,7 +34,6 @@ def _pointwise(activation: Any) -> Any:
     return activation
 
 
-Actor = TypeVar("Actor", bound=TanhGaussianActor)
 Activation = Annotated[Any, AfterValidator(_pointwise)]
 Cells = Annotated[Sequence[Width], Field(max_length=64)]
 ScaleInit = Annotated[float, Field(ge=1e-4, le=100)]  # TorchRL's mapping to a scale ends at 1e-4
@@ -89,6 +86,35 @@ def make_qvalue(
     return Critic(net, in_keys)
 
 
+class Critic(ValueOperator):
+    """What :func:`~torchrl_quad.make_value` and :func:`~torchrl_quad.make_qvalue` build."""
+
+    def __init__(self, network: Network, in_keys: Sequence[NestedKey]) -> None:
+        super().__init__(network, in_keys=list(in_keys))
+        self.built = layout(self)
+
+    def plain(self) -> Callable[[Mapping[str, Tensor], Sequence[Tensor]], Tensor] | None:
+        """The prediction (*, 1) as a pure function of the parameters, by name, and the inputs, each (*, k).
+
+        None if its parts were changed or hooked.
+        """
+        network = cast(Network, self.module)
+        if layout(self) != self.built or not network.is_plain:
+            return None
+
+        def predict(params: Mapping[str, Tensor], inputs: Sequence[Tensor]) -> Tensor:
+            x = network.joined(inputs)
+            for name, layer in network.mlp.named_children():
+                weight, bias = (params.get(f"module.mlp.{name}.{kind}") for kind in ("weight", "bias"))
+                if isinstance(layer, nn.LayerNorm):
+                    x = nn.functional.layer_norm(x, layer.normalized_shape, weight, bias, layer.eps)
+                else:
+                    x = layer(x) if weight is None else nn.functional.linear(x, weight, bias)
+            return x
+
+        return predict
+
+
 def first_action(env: EnvBase, action_init: Tensor | None, name: str) -> tuple[Bounded, Tensor]:
     """The spec of one action, and the mean of the first actions before the tanh, (k); errors are about ``name``."""
     check_env(env)
@@ -117,48 +143,6 @@ def first_action(env: EnvBase, action_init: Tensor | None, name: str) -> tuple[B
             f"{shown(action_init)}."
         )
     return spec, torch.atanh((first - middle) / (0.5 * (high - low)))
-
-
-def policy_of(
-    cls: type[Actor],
-    parts: Sequence[Any],
-    network: Network,
-    in_keys: Sequence[NestedKey],
-    spec: Bounded,
-    first: Tensor,
-    scale_init: float,
-    rho: float,
-    return_log_prob: bool,
-) -> Actor:
-    """A tanh-Gaussian policy of some parts and a last network, which reads ``in_keys``.
-
-    It begins with actions of mean ``first`` (k), before the tanh, whatever it reads.
-    """
-    layer = cast(nn.Linear, network.mlp[-1])
-    with torch.no_grad():
-        layer.weight.mul_(0.01)
-        layer.bias.zero_()
-        layer.bias[: len(first)] = first
-    least = min(0.01, 0.1 * scale_init)  # to which training can bring the scale down
-    max_loc = 5.0 if return_log_prob else math.inf  # as far as TorchRL's TanhNormal goes with tanh_loc=True
-    network.head = GaussianHead(len(first), f"biased_softplus_{scale_init}_{least}", max_loc, rho)
-    read = [*in_keys, "noise_before"] if rho else list(in_keys)
-    last = TensorDictModule(network, in_keys=read, out_keys=["loc", "scale"])
-    low, high = spec.low, spec.high
-    # Of what the parts hand on to each other only the memory is kept.
-    written = ["loc", "scale", *(key for part in parts for key in part.out_keys if key[0] == "next")]
-    actor = cls(
-        TensorDictSequential([*parts, last], selected_out_keys=written) if parts else last,
-        in_keys=["loc", "scale"],
-        spec=spec,
-        distribution_class=TanhNormal,
-        distribution_kwargs={} if (low == -1).all() and (high == 1).all() else {"low": low, "high": high},
-        return_log_prob=return_log_prob,
-    )
-    if rho:
-        actor.out_keys = [*actor.out_keys, "noise_before", "noise"]
-    actor.built = layout(actor)
-    return actor
 
 
 def network_of(

@@ -1,24 +1,26 @@
-"""Networks as pure functions of tensors: tanh-Gaussian policies that fly in the compiled step, and critics."""
+"""Networks as pure functions of tensors: tanh-Gaussian policies that fly in the compiled step."""
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import NormalParamExtractor, TensorDictSequential, dispatch
+from tensordict.nn import NormalParamExtractor
 from tensordict.nn.utils import biased_softplus
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torch.func import vjp
-from torchrl.envs.utils import ExplorationType, exploration_type
-from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
+from torchrl.modules import MLP
 
 from torchrl_quad.data.unwrap import leaf
 from torchrl_quad.errors import UserValueError, WrongState
+
+MEMORY = "recurrent_state"
+NEAREST = 0.3  # [m]; closer depths are clamped
 
 
 class GaussianHead(NormalParamExtractor):
@@ -103,137 +105,57 @@ class Network(nn.Module):
         return concatenated(inputs, self.scales)
 
 
-class Critic(ValueOperator):
-    """What :func:`~torchrl_quad.make_value` and :func:`~torchrl_quad.make_qvalue` build."""
-
-    def __init__(self, network: Network, in_keys: Sequence[NestedKey]) -> None:
-        super().__init__(network, in_keys=list(in_keys))
-        self.built = layout(self)
-
-    def plain(self) -> Callable[[Mapping[str, Tensor], Sequence[Tensor]], Tensor] | None:
-        """The prediction (*, 1) as a pure function of the parameters, by name, and the inputs, each (*, k).
-
-        None if its parts were changed or hooked.
-        """
-        network = cast(Network, self.module)
-        if layout(self) != self.built or not network.is_plain:
-            return None
-
-        def predict(params: Mapping[str, Tensor], inputs: Sequence[Tensor]) -> Tensor:
-            x = network.joined(inputs)
-            for name, layer in network.mlp.named_children():
-                weight, bias = (params.get(f"module.mlp.{name}.{kind}") for kind in ("weight", "bias"))
-                if isinstance(layer, nn.LayerNorm):
-                    x = nn.functional.layer_norm(x, layer.normalized_shape, weight, bias, layer.eps)
-                else:
-                    x = layer(x) if weight is None else nn.functional.linear(x, weight, bias)
-            return x
-
-        return predict
-
-
-class TanhGaussianActor(ProbabilisticActor):
-    """What :func:`~torchrl_quad.make_actor` builds: a tanh-Gaussian policy that environments can fly as pure functions.
-
-    With noise that is correlated in time it writes ``noise``, which a flight hands on, and ``noise_before``, that of
-    the step before. If there is none yet it is drawn. A deterministic flight has none.
-    """
-
-    built: list[Any]  # its layout
-
-    @property
-    def last(self) -> Network:
-        """The network that ends in the head."""
-        parts: Any = self[0]
-        return cast(Network, (parts[-1] if isinstance(parts, TensorDictSequential) else parts).module)
-
-    @property
-    def sampler(self) -> Any:
-        """The part that samples."""
-        return self[1]
-
-    @property
-    def is_random(self) -> bool | None:
-        """Whether it samples, or takes the mode; None if it is asked for something else."""
-        kind = exploration_type() or self.sampler.default_interaction_type
-        return {ExplorationType.RANDOM: True, ExplorationType.DETERMINISTIC: False}.get(kind)
-
-    @property
-    def log_prob_entry(self) -> NestedKey | None:
-        """The entry of the log-probability, if it is wanted."""
-        return self.sampler.log_prob_key if self.sampler.return_log_prob else None
-
-    @property
-    def bounds(self) -> tuple[Tensor, Tensor] | None:
-        """The least and the greatest action, each (k); None for -1 and 1."""
-        bounds = self.sampler.distribution_kwargs
-        return (bounds["low"], bounds["high"]) if bounds else None
-
-    @dispatch(auto_batch_size=False)
-    def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
-        """Write loc, scale and action, the noise if it is correlated, and the log-probability if wanted."""
-        head = getattr(self.last, "head", None)
-        if not isinstance(head, GaussianHead) or not head.rho:
-            return super().forward(tensordict, **kwargs)
-        is_random, before = self.is_random, tensordict.get("noise", None)
-        if before is None or not is_random:
-            last = cast(nn.Linear, self.last.mlp[-1])
-            before = _first_noise(last.weight.new_zeros((*tensordict.batch_size, head.size)), is_random)
-        tensordict.set("noise_before", before)
-        if is_random is None:
-            return super().forward(tensordict, **kwargs).set("noise", before)
-        # Evaluated for each of the two, which fixes the order in which gradients add up.
-        loc, scale = (leaf(self[0](tensordict), key) for key in ("loc", "scale"))
-        xi = _first_noise(torch.zeros_like(loc.detach()), is_random)
-        written = tanh_gaussian(loc, scale, xi, self.bounds, self.log_prob_entry)
-        return tensordict.update(written).set("noise", head.next(before, xi))
-
-    def plain(self) -> PlainTanhGaussian | None:
-        """The policy as pure functions of its present weights; None if its parts were changed or hooked."""
-        if type(self) is not TanhGaussianActor or self.is_random is None or layout(self) != self.built:
-            return None
-        reads_twice = len(set(map(str, self[0].in_keys))) < len(self[0].in_keys)
-        return None if reads_twice or not self.last.is_plain else PlainTanhGaussian(self)
-
-
 class PlainTanhGaussian:
-    """A tanh-Gaussian policy on plain tensors; see the engine's ``PlainPolicy``."""
+    """A tanh-Gaussian policy on plain tensors, with eyes, memory, both or neither; see the engine's ``PlainPolicy``.
+
+    It has these layers: convolutions, if it sees; a trunk; a memory, if it has one, which reads what the trunk returns;
+    and a last one, which reads both. The image has no gradient where ``without_gradient`` names it.
+    """
 
     without_gradient: frozenset[NestedKey] = frozenset()
     squashes = True  # the action is a tanh
+    nearest = NEAREST
 
-    def __init__(self, actor: TanhGaussianActor) -> None:
-        network, self.is_random = actor.last, actor.is_random
-        self.scales, self.widths = network.scales, network.widths
-        self.in_keys, self.out_keys = list(actor[0].in_keys)[: len(self.scales)], list(actor.out_keys)
-        self.memory: dict[NestedKey, tuple[int, ...]] = {}
-        self.activations, layers = list(network.mlp)[1::2], cast(list[nn.Linear], list(network.mlp)[::2])
-        self.weights = tuple(x for layer in layers for x in (layer.weight, layer.bias))
+    def __init__(
+        self,
+        actor: Any,
+        in_keys: Sequence[NestedKey],
+        reader: Network,
+        trunk: Sequence[nn.Module],
+        convolutions: Sequence[nn.Module] = (),
+        gru: Any = None,
+    ) -> None:
+        self.is_random, self.scales, self.widths = actor.is_random, reader.scales, reader.widths
+        self.sees, self.lenses, self.activations = bool(convolutions), [*convolutions[1::2]], [*trunk[1::2]]
+        self.memory = {MEMORY: (1, gru.hidden_size)} if gru else {}
+        self.in_keys, self.out_keys = [*map(unravel_key, in_keys), *self.memory], list(actor.out_keys)
+        before = [(x.weight, x.bias) for x in cast(Any, [*convolutions[::2], *trunk[::2]])]
+        gates = [(gru.weight_ih_l0, gru.bias_ih_l0), (gru.weight_hh_l0, gru.bias_hh_l0)] if gru else []
+        last = actor.last.mlp[-1]
+        self.weights = tuple(x for pair in (*before, *gates, (last.weight, last.bias)) for x in pair)
         self._take_head(actor)
 
     @functools.cached_property
     def signature(self) -> Hashable:
         """What it computes; a compiler of a loss need not describe it."""
-        return (*self._describe(), str(self.activations))
-
-    def _describe(self) -> tuple[Any, ...]:
-        """What it computes, apart from its activations."""
-        mapping = cast(biased_softplus, self.head.scale_mapping)
+        mapping, parts = cast(biased_softplus, self.head.scale_mapping), (self.lenses, self.activations)
         return (
-            *map(str, (self.in_keys, self.out_keys, self.scales, self.low, self.high)),
+            *map(str, (self.in_keys, self.out_keys, self.scales, self.low, self.high, *parts)),
             *(tuple(x.shape) for x in self.weights),
             (self.head.scale_lb, mapping.bias, mapping.min_val, self.rho, self.head.max_loc),
         )
 
-    def _take_head(self, actor: TanhGaussianActor) -> None:
+    def _take_head(self, actor: Any) -> None:
         self.head = cast(GaussianHead, actor.last.head)
         self.size, self.rho, self.log_prob_key = self.head.size, self.head.rho, actor.log_prob_entry
         self.low, self.high = (x.tolist() for x in actor.bounds) if actor.bounds else (None, None)
 
     def fits(self, inputs: Sequence[Tensor]) -> bool:
-        """Whether the first layer can read inputs of this width, precision and device."""
-        x, weight = torch.cat([x[:1] for x in inputs], -1), self.weights[0]
-        return (x.shape[-1], x.dtype, x.device) == (weight.shape[1], weight.dtype, weight.device)
+        """Whether the network can read inputs of this width, precision and device."""
+        like, vectors = self.weights[0], self._vectors(inputs)
+        fits = [x.shape[-1] for x in vectors] == list(self.widths[self.sees :])
+        read = torch.cat([x[:1] for x in vectors], -1), *inputs[: self.sees], *inputs[self.sees + len(vectors) :]
+        return fits and all((x.dtype, x.device) == (like.dtype, like.device) for x in read)
 
     def drawn(self, steps: int, n: int, before: Mapping[NestedKey, Tensor]) -> Tensor:
         """Standard normal noise, as the distribution would draw it step by step; zeros for the mode.
@@ -246,7 +168,7 @@ class PlainTanhGaussian:
                 x.normal_()
             return noise
         last = before.get("noise") if self.is_random else None
-        last = _first_noise(torch.zeros_like(noise[0]), self.is_random) if last is None else last
+        last = first_noise(torch.zeros_like(noise[0]), self.is_random) if last is None else last
         earlier = []
         for x in noise:
             earlier.append(last)
@@ -278,19 +200,27 @@ class PlainTanhGaussian:
         return leaf(tensordict, "loc"), leaf(tensordict, "scale")
 
     def distribution(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """loc and scale (*, k) in the states of a rollout (*), with gradients in the weights alone."""
-        keys = [*self.in_keys, *(["noise_before"] if self.rho else [])]
-        read = [leaf(tensordict, key).detach().flatten(0, -2) for key in keys]
-        own = len(self.in_keys)
-        loc, scale = self.head(self.layers(self.weights, read[:own])[-1], *read[own:])
+        """loc and scale (*, k) in the states of a rollout (*), with gradients in the weights alone.
+
+        A memory is built up again over the last dimension, if that is time.
+        """
+        has_time = tensordict.ndim > 1 or tensordict.names[-1] == "time"
+        keys = [*self.in_keys, *(["is_init"] if self.memory else []), *(["noise_before"] if self.rho else [])]
+        read = {key: leaf(tensordict, key).detach().flatten(0, tensordict.ndim - 1) for key in keys}
+        lasts = ~read["is_init"].view(-1, tensordict.shape[-1] if has_time else 1, 1) if self.memory else None
+        raw = self.layers(self.weights, [read[key] for key in self.in_keys], lasts)[-1]
+        loc, scale = self.head(raw, *(read[key] for key in keys if key == "noise_before"))
         return loc.view(*tensordict.shape, -1), scale.view(*tensordict.shape, -1)
 
     def forward(
         self, weights: Sequence[Tensor], inputs: Sequence[Tensor], drawn: Tensor
     ) -> tuple[list[Tensor], dict[NestedKey, Tensor]]:
-        """What each layer returns before its activation, and loc, scale, action, and log-probability if wanted."""
+        """What the layers return, as ``adjoint`` reads it, and all that the policy writes."""
         kept = self.layers(weights, inputs)
-        return kept, self._sample(kept[-1], drawn)
+        written = self._sample(kept[-1], drawn)
+        if self.memory:
+            written["next", MEMORY] = kept.pop(-2).unsqueeze(-2)
+        return kept, {key: written[key] for key in self.out_keys}
 
     def adjoint(
         self,
@@ -301,31 +231,97 @@ class PlainTanhGaussian:
         grads: dict[NestedKey, Tensor],
     ) -> tuple[list[Tensor], list[Tensor], Tensor]:
         """What each layer read, and the gradient of what it returned; the gradients of inputs and noise."""
-        grad, grad_drawn = vjp(self._sample, kept[-1], drawn)[1](grads)
-        read, grads_kept = [], [grad]
-        for weight, activation, x in zip(weights[-2:0:-2], self.activations[::-1], kept[-2::-1], strict=True):
-            activated, pull = vjp(activation, x)[:2]
-            (grad,) = pull(grad @ weight)
-            read.append(activated)
-            grads_kept.append(grad)
-        read.append(concatenated(inputs, self.scales))
-        of_inputs = (grad @ weights[0]).split([x.shape[-1] for x in inputs], -1)
-        of_inputs = [g if scale == 1.0 else g * scale for g, scale in zip(of_inputs, self.scales, strict=True)]
-        return [*read[::-1], *grads_kept[::-1]], of_inputs, grad_drawn
+        layers, seen, kept = self._after_eyes(weights), kept[: self.sees], kept[self.sees :]
+        own = {key: grads[key] for key in self.out_keys if key != ("next", MEMORY)}
+        grad, grad_drawn = vjp(self._sample, kept[-1], drawn)[1](own)
+        activated = [vjp(activation, x)[:2] for activation, x in zip(self.activations, kept, strict=False)]
+        read, of_x = [self._joined(inputs, seen), *(x for x, _ in activated)], grad @ layers[-1][0]
+        of_kept, of_memory = [grad], []
+        if self.memory:
+            h, (gates, new, own_new) = inputs[-1].squeeze(-2), kept[-4:-1]
+            of_x, of_recalled = of_x.split([read[-1].shape[1], h.shape[1]], 1)
+            of_recalled = of_recalled + grads["next", MEMORY].squeeze(-2)
+            of_gates, of_own_new, of_h = gradient_before(of_recalled, h, gates, new, own_new, layers[-2][0])
+            read, of_kept = [*read, h, recalled_by(gates, new, h)], [of_gates, of_own_new, grad]
+            of_x = of_x + of_gates @ layers[-3][0]
+            of_memory = [of_h.unsqueeze(-2)]
+        for (_, pull), (weight, _) in reversed([*zip(activated, layers, strict=False)]):
+            (grad,) = pull(of_x)
+            of_kept, of_x = [grad, *of_kept], grad @ weight
+        parts = zip(of_x.split(list(self.widths), 1), self.scales, strict=True)
+        of_read = [g if scale == 1.0 else g * scale for g, scale in parts]
+        if not self.sees:
+            return [*read, *of_kept], [*of_read, *of_memory], grad_drawn
+        image, of_seen = inputs[0], of_read[0]
+        of_read[0] = torch.zeros_like(image)
+        if self.in_keys[0] not in self.without_gradient:
+            (of_read[0],) = vjp(lambda image: self._see(weights, [image])[0], image)[1](of_seen)
+        return [image, of_seen, *read, *of_kept], [*of_read, *of_memory], grad_drawn
 
     def weight_gradient(self, weights: Sequence[Tensor], traces: Sequence[Tensor]) -> list[Tensor]:
         """The gradients of weight and bias of each layer, over a batch."""
+        seen: tuple[Tensor, ...] = ()
+        if self.sees:
+            (image, of_seen, *traces), count = traces, 2 * len(self.lenses)
+            seen = vjp(lambda *own: self._see(own, [image])[0], *weights[:count])[1](of_seen)
         count = len(traces) // 2
         pairs = zip(traces[:count], traces[count:], strict=True)
-        return [g for x, grad in pairs for g in (grad.t() @ x, grad.sum(0))]
+        found = [g for x, grad in pairs for g in (grad.t() @ x, grad.sum(0))]
+        if self.memory:  # whose own layer has the first gradients of the other's, and whose head reads x as well
+            x, h = traces[count - 3 : count - 1]
+            of_gates, _, grad = traces[-3:]
+            size, (of_bias, own, own_bias, head, bias) = 2 * h.shape[1], found[-5:]
+            own = torch.cat((of_gates[:, :size].t() @ h, own))
+            found[-4:] = own, torch.cat((of_bias[:size], own_bias)), torch.cat((grad.t() @ x, head), 1), bias
+        return [*seen, *found]
 
-    def layers(self, weights: Sequence[Tensor], inputs: Sequence[Tensor]) -> list[Tensor]:
-        """What each layer returns before its activation, for inputs (n, k_i)."""
-        x, kept = concatenated(inputs, self.scales), []
-        for weight, bias, activation in zip(weights[::2], weights[1::2], [*self.activations, None], strict=True):
+    def layers(self, weights: Sequence[Tensor], inputs: Sequence[Tensor], lasts: Tensor | None = None) -> list[Tensor]:
+        """What the eyes return, and each layer before its activation; before the last one, what the memory recalls.
+
+        Inputs are (n, ...). Where they are states of flights, one after another, ``lasts``, bool (flights, horizon, 1),
+        says where a memory is kept from the step before; otherwise each state comes with its memory, whose gates are
+        also returned.
+        """
+        kept, layers = self._see(weights, inputs), self._after_eyes(weights)
+        x = self._joined(inputs, kept)
+        for (weight, bias), activation in zip(layers, self.activations, strict=False):
             kept.append(torch.addmm(bias, x, weight.t()))
-            x = kept[-1] if activation is None else activation(kept[-1])
-        return kept
+            x = activation(kept[-1])
+        if self.memory:
+            h, (weight, bias), own = inputs[-1].squeeze(-2), *layers[-3:-1]
+            read = torch.addmm(bias, x, weight.t())
+            if lasts is None:
+                gates, new, own_new = gates_of(read, h, *own)
+                kept += [gates, new, own_new, recalled_by(gates, new, h)]
+            else:
+                read, h = (y.unflatten(0, lasts.shape[:2]).transpose(0, 1) for y in (read, h))
+                recalled = Recall.apply(read, h[0], lasts.to(read).transpose(0, 1), *own)
+                kept.append(cast(Tensor, recalled).transpose(0, 1).flatten(0, 1))
+            x = torch.cat((x, kept[-1]), 1)
+        weight, bias = layers[-1]
+        return [*kept, torch.addmm(bias, x, weight.t())]
+
+    def _after_eyes(self, weights: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
+        """Weight and bias of each layer after the convolutions."""
+        own = weights[2 * len(self.lenses) :]
+        return list(zip(own[::2], own[1::2], strict=True))
+
+    def _see(self, weights: Sequence[Tensor], inputs: Sequence[Tensor]) -> list[Tensor]:
+        """What the convolutions return of a depth image (n, channels, height, width) [m], (n, k); nothing if blind."""
+        if not self.sees:
+            return []
+        x = inputs[0].clamp_min(self.nearest).reciprocal()
+        for weight, bias, activation in zip(weights[::2], weights[1::2], self.lenses, strict=False):
+            x = activation(nn.functional.conv2d(x, weight, bias, stride=2, padding=1))
+        return [x.flatten(1)]
+
+    def _vectors(self, inputs: Sequence[Tensor]) -> Sequence[Tensor]:
+        """The inputs that are neither the image nor the memory."""
+        return inputs[self.sees : len(inputs) - len(self.memory)]
+
+    def _joined(self, inputs: Sequence[Tensor], seen: Sequence[Tensor]) -> Tensor:
+        """What the first layer after the convolutions reads."""
+        return concatenated([*seen, *self._vectors(inputs)], self.scales)
 
     def squash(
         self, loc: Tensor, scale: Tensor, xi: Tensor, log_prob_key: NestedKey | None = None
@@ -345,7 +341,7 @@ class PlainTanhGaussian:
         return {key: written[key] for key in self.out_keys if key in written}
 
 
-def _first_noise(x: Tensor, is_random: bool | None) -> Tensor:
+def first_noise(x: Tensor, is_random: bool | None) -> Tensor:
     """Standard normal numbers into zeros (*, k), or the zeros where nothing is random."""
     return x.normal_() if is_random else x
 

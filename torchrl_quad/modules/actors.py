@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Annotated, Any, TypeVar, cast
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, cast
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.data import Bounded, Unbounded
+from torchrl.data import Unbounded
 from torchrl.envs import EnvBase, TensorDictPrimer
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import MLP, ConvNet, GRUModule, ProbabilisticActor, TanhNormal, set_recurrent_mode
@@ -31,8 +31,6 @@ from torchrl_quad.modules.plain import (
     tanh_gaussian,
 )
 from torchrl_quad.options import Below1, Entries, Entry, Field, Scale, Width, checked
-
-_Actor = TypeVar("_Actor", bound="TanhGaussianActor")
 
 
 @checked
@@ -88,11 +86,8 @@ def make_actor(
             raise UserValueError("A memory reads the last hidden layer: give num_cells at least one, such as [64].")
         trunk = network_of(env, in_keys, num_cells[-1], num_cells[:-1], activation, input_scale)
         return _composed(env, "make_actor", Features(None, trunk, activation()), in_keys, hidden_size, *head)
-    spec, first = first_action(env, action_init, "make_actor")
-    size = 2 * len(first) if learn_scale else len(first)
-    net = network_of(env, in_keys, size, num_cells, activation, input_scale)
-    options = scale_init, noise_correlation, return_log_prob
-    return policy_of(TanhGaussianActor, [], net, in_keys, spec, first, *options)
+    options = num_cells, activation, input_scale
+    return _policy(env, "make_actor", [], in_keys, lambda size: network_of(env, in_keys, size, *options), *head)
 
 
 @checked
@@ -169,19 +164,9 @@ def make_visual_actor(
 
 
 def _composed(
-    env: EnvBase,
-    name: str,
-    features: Features,
-    in_keys: Sequence[NestedKey],
-    hidden_size: int,
-    action_init: Tensor | None,
-    scale_init: float,
-    learn_scale: bool,
-    noise_correlation: float,
-    return_log_prob: bool,
-) -> ComposedActor:
-    """A policy of features, a memory if it has a size, and a head."""
-    spec, first = first_action(env, action_init, name)
+    env: EnvBase, name: str, features: Features, in_keys: Sequence[NestedKey], hidden_size: int, *head: Any
+) -> TanhGaussianActor:
+    """A policy of features, a memory if it has a size, and a head, as :func:`_policy` takes it."""
     width, dtype = cast(nn.Linear, features.trunk.mlp[-1]).out_features, next(features.parameters()).dtype
     parts: list[Any] = [TensorDictModule(features, in_keys=list(in_keys), out_keys=["features"])]
     widths = [width]
@@ -196,27 +181,31 @@ def _composed(
         ).to(dtype)
         parts.append(memory)
         widths.append(hidden_size)
-    size = 2 * len(first) if learn_scale else len(first)
-    last = Network(MLP(sum(widths), size, num_cells=[], device=env.device).to(dtype), [1.0] * len(widths), widths)
-    read, options = ["features", "recalled"][: len(widths)], (scale_init, noise_correlation, return_log_prob)
-    return policy_of(ComposedActor, parts, last, read, spec, first, *options)
+
+    def last(size: int) -> Network:
+        return Network(MLP(sum(widths), size, num_cells=[], device=env.device).to(dtype), [1.0] * len(widths), widths)
+
+    return _policy(env, name, parts, ["features", "recalled"][: len(widths)], last, *head)
 
 
-def policy_of(
-    cls: type[_Actor],
+def _policy(
+    env: EnvBase,
+    name: str,
     parts: Sequence[Any],
-    network: Network,
     in_keys: Sequence[NestedKey],
-    spec: Bounded,
-    first: Tensor,
+    make_last: Callable[[int], Network],
+    action_init: Tensor | None,
     scale_init: float,
+    learn_scale: bool,
     rho: float,
     return_log_prob: bool,
-) -> _Actor:
-    """A tanh-Gaussian policy of some parts and a last network, which reads ``in_keys``.
+) -> TanhGaussianActor:
+    """A tanh-Gaussian policy of some parts and a last network of a given size, which reads ``in_keys``.
 
-    It begins with actions of mean ``first`` (k), before the tanh, whatever it reads.
+    It begins with the action ``action_init``, whatever it reads. Errors are about ``name``.
     """
+    spec, first = first_action(env, action_init, name)
+    network = make_last(2 * len(first) if learn_scale else len(first))
     layer = cast(nn.Linear, network.mlp[-1])
     with torch.no_grad():
         layer.weight.mul_(0.01)
@@ -230,7 +219,7 @@ def policy_of(
     low, high = spec.low, spec.high
     # Of what the parts hand on to each other only the memory is kept.
     written = ["loc", "scale", *(key for part in parts for key in part.out_keys if key[0] == "next")]
-    actor = cls(
+    actor = (ComposedActor if parts else TanhGaussianActor)(
         TensorDictSequential([*parts, last], selected_out_keys=written) if parts else last,
         in_keys=["loc", "scale"],
         spec=spec,

@@ -372,8 +372,3 @@ class Replay(PlainTanhGaussian):
         with set_recurrent_mode(has_time):
             read = cast(TensorDictBase, self.actor.get_dist_params(tensordict.select(*self.actor.in_keys).detach()))
         return leaf(read, "loc"), leaf(read, "scale")
-
-    def replay(self, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
-        """What it writes in the states of a rollout (*, horizon), with the noise of the rollout."""
-        noise = self.drawn_again(tensordict)[:, : self.size].view_as(leaf(tensordict, "action"))
-        return self.squash(*self.distribution(tensordict), noise, self.log_prob_key)

@@ -212,6 +212,11 @@ class PlainTanhGaussian:
         loc, scale = self.head(raw, *(read[key] for key in keys if key == "noise_before"))
         return loc.view(*tensordict.shape, -1), scale.view(*tensordict.shape, -1)
 
+    def replay(self, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
+        """What it writes in the states of a rollout (*), with the noise of the rollout."""
+        noise = self.drawn_again(tensordict)[:, : self.size].view_as(leaf(tensordict, "action"))
+        return self.squash(*self.distribution(tensordict), noise, self.log_prob_key)
+
     def forward(
         self, weights: Sequence[Tensor], inputs: Sequence[Tensor], drawn: Tensor
     ) -> tuple[list[Tensor], dict[NestedKey, Tensor]]:

@@ -27,9 +27,11 @@ def sample_action(actor: TensorDictModule, params: TensorDictParams, tensordict:
         plain = actor.plain() if hasattr(actor, "plain") and not hasattr(actor, "replayed") else None
         if plain is None:
             return actor(tensordict)
-        _check_precision(actor, plain.in_keys, [leaf(tensordict, key) for key in plain.in_keys], params)
-        written = act(plain, tensordict, plain.drawn(1, tensordict.numel(), {})[0])
-    return tensordict.update(written)
+        inputs = [leaf(tensordict, key) for key in plain.in_keys]
+        _check_precision(actor, plain.in_keys, inputs, params)
+        drawn = plain.drawn(1, tensordict.numel(), {})[0]
+        _, written = plain.forward(plain.weights, [x.reshape(-1, x.shape[-1]) for x in inputs], drawn)
+    return tensordict.update({key: x.view(*tensordict.shape, *x.shape[1:]) for key, x in written.items()})
 
 
 def predict(
@@ -102,13 +104,6 @@ def with_fixed(loss: Any, given: Mapping[str, Any], **fixed: Any) -> dict[str, A
 def total(parts: Iterable[Tensor]) -> Tensor:
     """The sum of some tensors, at least one."""
     return cast(Tensor, sum(parts))
-
-
-def act(plain: Any, tensordict: TensorDictBase, drawn: Tensor) -> dict[NestedKey, Tensor]:
-    """What a plain policy writes in states (*), from what was drawn for each of them, (n, k)."""
-    inputs = [x.reshape(-1, x.shape[-1]) for x in (leaf(tensordict, key) for key in plain.in_keys)]
-    _, written = plain.forward(plain.weights, inputs, drawn)
-    return {key: x.view(*tensordict.shape, *x.shape[1:]) for key, x in written.items()}
 
 
 def segments(done: Tensor) -> tuple[Tensor, Tensor]:
@@ -191,10 +186,7 @@ def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: Ten
     from that at the start. Actions within 1e-6 of a bound count as if they were that far from it.
     """
     with params.to_module(actor):
-        plain = plain_of(actor, tensordict)
-        if hasattr(plain, "replay"):
-            return plain.replay(tensordict)
-        return act(plain, tensordict.select(*plain.in_keys).detach(), plain.drawn_again(tensordict))
+        return plain_of(actor, tensordict).replay(tensordict)
 
 
 def plain_of(actor: TensorDictModule, tensordict: TensorDictBase) -> Any:

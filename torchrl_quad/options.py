@@ -174,12 +174,14 @@ def buildable(cls: type, name: str) -> AfterValidator:
     return AfterValidator(validate)
 
 
-def imported(path: str, what: str = "task") -> Any:
+def imported(path: Any, what: str = "task") -> Any:
     """What a path leads to, such as "mypackage.WindowEnv"; its module is imported.
 
     Raises:
-        ValueError: there is no such module, or it has nothing of that name.
+        ValueError: it is no path, there is no such module, or that has nothing of this name.
     """
+    if not (isinstance(path, str) and re.fullmatch(r"\w+(\.\w+)+", path)):
+        raise UserValueError(f"{what}={shown(path)}: it must be the path of a class, such as mypackage.Mine.")
     module, _, name = path.rpartition(".")
     try:
         found = importlib.import_module(module)

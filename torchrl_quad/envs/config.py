@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -86,9 +85,6 @@ def as_disturbances(value: Any, setting: str = "disturbances") -> list[Disturban
         arguments = dict(x) if isinstance(x, Mapping) else {}
         found = arguments.pop("_target_", x)
         if isinstance(found, str):
-            if not re.fullmatch(r"\w+(\.\w+)+", found):
-                said = f"{setting}={shown(found)}: it must be the path of a class, such as mypackage.Mine."
-                raise UserValueError(said)
             found = imported(found, setting)
         if isinstance(found, type) and issubclass(found, Disturbance):
             found = build(found, setting, arguments)

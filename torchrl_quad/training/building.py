@@ -19,11 +19,10 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_quad import ObservationNormalizer, QuadrotorEnv, TrustRegion, make_actor, make_env, make_visual_actor
 from torchrl_quad.data.unwrap import base_env, leaf, observed
-from torchrl_quad.envs.registry import imported
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives import PathwiseLoss, SHACLoss
-from torchrl_quad.options import argument_names
-from torchrl_quad.training.configuration import own_disturbances, plain
+from torchrl_quad.options import argument_names, imported
+from torchrl_quad.training.configuration import plain
 
 SEEDS_PER_PROCESS = 10_000
 SMOOTHING = 0.05  # how much of the scale of returns is new in each iteration
@@ -80,8 +79,8 @@ def build_env(
 ) -> EnvBase:
     """Build the environment of a configuration, with a normaliser, and its state, if it asks for one."""
     options = plain(cfg.env, resolve=True)
-    if (disturbances := own_disturbances(options.pop("disturbances", None))) is not None:
-        options["disturbances"] = disturbances
+    if options.get("disturbances") is None:  # a task may have some of its own
+        options.pop("disturbances", None)
     env = make_env(cfg.task, num_envs=num_envs, device=cfg.device, seed=seed, compile=compile, **options)
     if not cfg.normalize:
         return env

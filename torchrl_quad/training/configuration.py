@@ -7,7 +7,7 @@ import contextlib
 import functools
 import inspect
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import NoneType
 from typing import Any, cast
@@ -18,10 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_quad import QuadrotorEnv, available_tasks
 from torchrl_quad.envs import TASKS, task_class
-from torchrl_quad.envs.config import as_disturbances
-from torchrl_quad.envs.disturbances import Disturbance
-from torchrl_quad.envs.registry import imported
-from torchrl_quad.errors import UserTypeError, UserValueError, shown
+from torchrl_quad.errors import UserValueError
 
 CONFIG = Path(__file__).parent / "config"  # in the repository a link to recipes/config
 SET_BY_RECIPES = ("num_envs", "device", "seed", "compile")  # settings outside ``env``
@@ -81,21 +78,6 @@ def defaults(cls: type[QuadrotorEnv]) -> dict[str, Any]:
         if is_plain and differs and name not in (*SET_BY_RECIPES, "disturbances"):
             settings[name] = default
     return settings
-
-
-def own_class(path: Any, base: type, setting: str) -> type:
-    """Import a subclass of ``base`` by its path, such as "mypackage.Gust"; a UserError says what is wrong with it."""
-    if not (isinstance(path, str) and re.fullmatch(r"\w+(\.\w+)+", path)):
-        raise UserValueError(f"{setting}={shown(path)}: it must be the path of a class, such as mypackage.Mine.")
-    cls = imported(path, setting)
-    if not (isinstance(cls, type) and issubclass(cls, base)):
-        raise UserTypeError(f"{setting}={path}: it must be a subclass of {base.__name__}.")
-    return cls
-
-
-def own_disturbances(specs: Sequence[str | Mapping[str, Any]] | None) -> list[Disturbance] | None:
-    """The disturbances that ``env.disturbances`` names: paths, or mappings with ``_target_`` and arguments."""
-    return None if specs is None else as_disturbances(specs, "env.disturbances")
 
 
 def named_code(values: Any) -> list[str]:

@@ -20,7 +20,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from torchrl_quad import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, PODSLoss, SAPOLoss, SHACLoss
 from torchrl_quad.envs import task_class
-from torchrl_quad.errors import UserValueError, shown
+from torchrl_quad.envs.config import as_disturbances
+from torchrl_quad.errors import UserTypeError, UserValueError, shown
 from torchrl_quad.objectives import PathwiseLoss
 from torchrl_quad.options import (
     Below1,
@@ -38,9 +39,10 @@ from torchrl_quad.options import (
     argument_names,
     check_known,
     declared,
+    imported,
     must,
 )
-from torchrl_quad.training.configuration import CONFIG, OWN, SET_BY_RECIPES, own_class, own_disturbances, plain, tuned
+from torchrl_quad.training.configuration import CONFIG, OWN, SET_BY_RECIPES, plain, tuned
 
 
 class Section(BaseModel):
@@ -231,7 +233,7 @@ def check(cfg: DictConfig, overrides: Sequence[str] = ()) -> None:
     except ValidationError as error:
         raise UserValueError(_sentence(schema, error.errors()[0])) from None
     if "algorithm" in values:
-        own_disturbances(values.get("env", {}).get("disturbances"))
+        as_disturbances(values.get("env", {}).get("disturbances") or (), "env.disturbances")
         _check_together(values, asked)
 
 
@@ -298,7 +300,9 @@ def _loss(kind: type | None, added: Mapping[str, Any], values: Any, asked: Mappi
     if path := values.get("_target_"):
         if kind is None:
             raise UserValueError(f"loss._target_={path}: this recipe takes only TorchRL's loss. Write your own recipe.")
-        own = own_class(path, PathwiseLoss if kind is BPTTLoss else kind, "loss._target_")
+        own, base = imported(path, "loss._target_"), PathwiseLoss if kind is BPTTLoss else kind
+        if not (isinstance(own, type) and issubclass(own, base)):
+            raise UserTypeError(f"loss._target_={path}: it must be a subclass of {base.__name__}.")
         options |= declared(own)
         # A setting of the recipe's own loss that this one lacks is left out, but the command line must not name it.
         unasked = {name for name in values if f"loss.{name}" not in asked}

@@ -164,10 +164,15 @@ def build(cls: type[_T], name: str, spec: Any, **more: Any) -> _T:
 
 def buildable(cls: type, name: str) -> AfterValidator:
     """What :func:`build` makes such an object of, or None: ``Annotated[Any, buildable(...)]``."""
+    return explained(functools.partial(build, cls, name), name)
+
+
+def explained(make: Callable[[Any], Any], name: str) -> AfterValidator:
+    """None, or what a function takes that says what is wrong of ``name``: ``Annotated[Any, explained(...)]``."""
 
     def validate(value: Any) -> Any:
         try:
-            return value if value is None else build(cls, name, value)
+            return value if value is None else make(value)
         except UserValueError as error:
             raise Explained(str(error).removeprefix(f"{name}: ")) from None
 

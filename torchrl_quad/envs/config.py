@@ -17,7 +17,7 @@ from torchrl_quad.envs.any_drone import any_drone
 from torchrl_quad.envs.disturbances import Disturbance, DroneRandomization, RandomStart, Sensors, Wind
 from torchrl_quad.envs.scenes import MountedCamera, Scene
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
-from torchrl_quad.options import Explained, accepted, between, build, buildable, check_value, imported
+from torchrl_quad.options import Explained, accepted, between, build, buildable, check_value, explained, imported
 from torchrl_quad.vision import DepthCamera
 
 # A larger weight would leave none of the seven digits of single precision to the others.
@@ -28,13 +28,6 @@ def _dynamics(value: object) -> object:
     if not (isinstance(value, str) and value in DYNAMICS):  # users add to DYNAMICS
         raise UserValueError(f"be one of {', '.join(DYNAMICS)}")
     return value
-
-
-def _scene(value: Any) -> object:
-    try:
-        return value if value is None else Scene.of(value)
-    except UserValueError as error:
-        raise Explained(str(error).removeprefix("scene: ")) from None
 
 
 def _weights(weights: object) -> object:
@@ -69,7 +62,7 @@ RandomizeOption = Annotated[
     accepted(lambda x: isinstance(x, str | Path | Mapping | None) and x != "", "any, a mapping, or the path of a file"),
 ]
 DisturbancesOption = Annotated[Any, AfterValidator(lambda value: as_disturbances(value) and value)]
-SceneOption = Annotated[Any, AfterValidator(_scene)]
+SceneOption = Annotated[Any, explained(Scene.of, "scene")]
 CameraOption = Annotated[Any, buildable(DepthCamera, "camera")]
 WeightsOption = Annotated[Any, AfterValidator(_weights)]
 

@@ -26,6 +26,7 @@ LOSSES = {
     "bptt": lambda env, actor, **options: BPTTLoss(actor, **options),
     "shac": lambda env, actor, **options: SHACLoss(actor, make_value(env), **options),
     "abpt": lambda env, actor, **options: ABPTLoss(actor, make_qvalue(env), **options),
+    "simulated": lambda env, actor, **options: ABPTLoss(actor, make_qvalue(env), simulated_steps=2, **options),
 }
 FAR = 1e9  # medians: so long is no gradient
 
@@ -50,15 +51,16 @@ def gradient(loss, rollout):
 
 @pytest.mark.parametrize("name", LOSSES)
 def test_a_clip_that_never_clips_changes_no_gradient(env, name):
-    actor = make_actor(env)
+    samples_anew = name in ("abpt", "simulated")  # the actions after its last states: the same where there is no noise
+    actor = make_actor(env, scale_init=1e-4 if samples_anew else 0.1)
     clipped, plain = (LOSSES[name](env, actor, clip_action_gradient=clip) for clip in (FAR, None))
     clipped.load_state_dict({**clipped.state_dict(), **plain.state_dict()})
     rollout = flight(env, actor)
     (value, found), (expected_value, expected) = gradient(clipped, rollout), gradient(plain, rollout)
     torch.testing.assert_close(value, expected_value)
-    if name == "abpt":  # the actions after its last states are sampled anew each time
+    if samples_anew:
         a, b = (torch.cat([g.flatten() for g in x]) for x in (found, expected))
-        assert (a - b).norm() < 0.03 * b.norm()
+        assert (a - b).norm() < 2e-3 * b.norm()
     else:
         torch.testing.assert_close(found, expected)
 

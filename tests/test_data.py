@@ -5,8 +5,8 @@ import torch
 from refusals import cases, refuses
 from small_runs import assert_equal
 from tensordict.nn import TensorDictModule
-from torchrl.envs import Compose, EnvBase, PendulumEnv, RewardSum, StepCounter, TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs import Compose, PendulumEnv, RewardSum, StepCounter, TransformedEnv
+from torchrl.envs.utils import ExplorationType
 
 from torchrl_quad import HoveringEnv, TrackingEnv, VisitedStateBuffer, differentiable_rollout, make_actor, restart
 from torchrl_quad.errors import UserValueError
@@ -31,27 +31,6 @@ def test_the_rollout_keeps_the_graph_and_the_carry_drops_it_and_goes_on_where_th
     following, _ = differentiable_rollout(env, actor, carry, 3)
     assert torch.equal(following["state", "position"][:, 0], carry["state", "position"])
     assert (carry == before).all()  # it is not modified
-
-
-def test_it_equals_torchrl_s_own_loop():
-    def fly(function):
-        env = HoveringEnv(num_envs=4, seed=1, max_episode_steps=4, dtype=torch.float64)
-        start, again = env.reset(), env.reset()["state"]
-        env.set_initial_state_source(lambda n: again)
-        torch.manual_seed(3)
-        actor = make_actor(env)
-        rollout = function(env, actor, start)
-        rollout["next", "reward"].sum().backward()
-        entries = {key: x.detach() for key, x in rollout.items(include_nested=True, leaves_only=True)}
-        return entries | {name: p.grad for name, p in actor.named_parameters()}
-
-    def torchrl_s_loop(env, actor, start):
-        with set_exploration_type(ExplorationType.RANDOM):
-            return EnvBase.rollout(env, 10, actor, tensordict=start, auto_reset=False, break_when_any_done=False)
-
-    ours = fly(lambda env, actor, start: differentiable_rollout(env, actor, start, 10)[0])
-    torch.testing.assert_close(ours, fly(torchrl_s_loop))
-    assert ours["next", "done"].sum() == 8
 
 
 def test_it_samples_by_default_is_deterministic_on_request_and_resets_the_carry_of_a_finished_environment(env):

@@ -12,6 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_quad.dynamics import Dynamics, QuadrotorParams
+from torchrl_quad.dynamics.parameters import LIMITS
 from torchrl_quad.engine.packing import Key
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.disturbances import Disturbance
@@ -22,9 +23,6 @@ from torchrl_quad.envs.scenes import MountedCamera, Scene
 from torchrl_quad.envs.terms import Event
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.vision import DepthCamera
-
-#: Fields of a drone that must be above zero.
-POSITIVE = ("mass", "inertia", "motor_time_constant")
 
 
 class Task(abc.ABC):
@@ -270,7 +268,7 @@ def check_task(env: Task, state: State) -> None:
         if isinstance(key, tuple) and key[0] == "drone" and key[1] not in fields:
             raise UserValueError(f"Entry {key!r} changes no parameter of the drone. Choose from: {', '.join(fields)}.")
         if isinstance(key, tuple) and key[0] == "drone":
-            is_right = x.isfinite().all() and (key[1] not in POSITIVE or (x > 0).all())
+            is_right = x.isfinite().all() and (LIMITS[key[1]][0] <= 0.0 or (x > 0).all())
             check(bool(is_right), f"{entry} must be finite and, as in any drone, above zero.")
             one = env.nominal.value(key[1])
             shape = (n, *one.shape[-env.nominal.dim(key[1]) :])

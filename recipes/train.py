@@ -6,14 +6,7 @@ python recipes/train.py task=hovering seed=0
 from omegaconf import DictConfig
 
 from torchrl_quad import AHACLoss, differentiable_rollout, make_value, restart
-from torchrl_quad.training.building import (
-    Optimizer,
-    ReturnScale,
-    make_loss,
-    mean_of_all,
-    set_up,
-    update_normalizer,
-)
+from torchrl_quad.training.building import Optimizer, ReturnScale, make_loss, mean_of_all, set_up, update_normalizer
 from torchrl_quad.training.launch import recipe
 from torchrl_quad.training.loop import Run
 

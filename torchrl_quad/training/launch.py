@@ -32,7 +32,7 @@ from omegaconf.errors import OmegaConfBaseException
 import torchrl_quad
 from torchrl_quad.errors import UserError, UserValueError
 from torchrl_quad.files import locked, make_folder
-from torchrl_quad.training.building import rank, world_size
+from torchrl_quad.training.building import of_first, rank
 from torchrl_quad.training.checkpoints import take_over
 from torchrl_quad.training.configuration import CONFIG, OWN, command_line, named_code, own_recipe, plain
 from torchrl_quad.training.schema import check
@@ -202,15 +202,13 @@ def _run_folder(resume: str | None) -> Iterator[Path]:
     named = goes_on or any(x.lstrip("+").startswith(folders) for x in hydra_config.overrides.hydra)
     folder = Path(str(resume)).resolve().parent if goes_on else made
     with own_folder(folder, named) if rank() == 0 else contextlib.nullcontext(folder) as own:
-        values = [own]
-        if world_size() > 1:
-            dist.broadcast_object_list(values)  # that of the first process
-        if values[0] != made:
+        first = of_first(own)
+        if first != made:
             with contextlib.suppress(OSError):  # not empty
                 made.rmdir()
         with read_write(hydra_config):
-            hydra_config.runtime.output_dir = str(values[0])
-        yield values[0]
+            hydra_config.runtime.output_dir = str(first)
+        yield first
 
 
 @contextlib.contextmanager

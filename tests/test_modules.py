@@ -1,14 +1,11 @@
 """Networks that read their sizes from the environment, and exploration noise that is correlated in time."""
 
-import math
-
 import pytest
 import torch
 from refusals import cases, refuses
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
-from torch.distributions import Normal, TransformedDistribution
-from torch.distributions.transforms import TanhTransform
+from torch.distributions import Normal
 from torchrl.data import Unbounded
 from torchrl.envs import CatTensors, EnvBase, PendulumEnv, StepCounter, TransformedEnv, UnsqueezeTransform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -178,21 +175,6 @@ def test_the_noise_is_standard_normal_in_every_step_and_correlated_over_time():
     more, _ = differentiable_rollout(env, actor, carry, 3)
     assert torch.equal(more["noise_before"][:, 0], rollout["noise"][:, -1])  # also over resets
     assert 0 < rollout["next", "done"][:, -1].sum() < 512
-
-
-def test_loc_scale_and_log_probability_are_those_given_the_noise_of_the_step_before(env64):
-    actor = make_actor(env64, noise_correlation=RHO, scale_init=0.3, return_log_prob=True)
-    plain = make_actor(env64, scale_init=0.3)
-    plain.load_state_dict(actor.state_dict())
-    rollout, _ = differentiable_rollout(env64, actor, None, 20)
-    with torch.no_grad():
-        free = plain.get_dist_params(rollout.select("observation"))
-    torch.testing.assert_close(rollout["scale"], free["scale"] * math.sqrt(1 - RHO**2))
-    torch.testing.assert_close(rollout["loc"], free["loc"] + RHO * free["scale"] * rollout["noise_before"])
-    given = TransformedDistribution(Normal(rollout["loc"], rollout["scale"]), TanhTransform())
-    torch.testing.assert_close(rollout["action_log_prob"], given.log_prob(rollout["action"]).sum(-1))
-    marginal = torch.tanh(free["loc"] + free["scale"] * rollout["noise"])
-    torch.testing.assert_close(rollout["action"], marginal)
 
 
 def test_every_way_to_fly_gives_the_same_noise_values_and_gradients(env64):

@@ -1,9 +1,12 @@
 """Policies that see and remember: gradients through their memory, where it begins anew, and which losses take them."""
 
+import functools
 import math
 
 import pytest
 import torch
+from torch.distributions import Normal, TransformedDistribution
+from torch.distributions.transforms import TanhTransform
 from torch.func import functional_call
 from torchrl.envs import Compose, EnvBase, InitTracker, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -212,11 +215,11 @@ def test_losses_take_a_policy_that_sees(recurrent, noise_correlation):
     assert bound.divergence(rollout) <= 1e-3
 
 
-@pytest.mark.parametrize("recurrent", [True, False])
-def test_correlated_noise_of_a_policy_that_sees_is_that_of_its_head(recurrent):
-    env = forest(max_episode_steps=4)
-    actor = actor_for(env, recurrent=recurrent, scale_init=0.3, noise_correlation=0.9, return_log_prob=True)
-    white = actor_for(env, recurrent=recurrent, scale_init=0.3, return_log_prob=True)  # whose mean is bounded, too
+@pytest.mark.parametrize("kind", ["blind", "seeing", "remembering"])
+def test_loc_scale_and_log_probability_are_those_given_the_noise_of_the_step_before(kind):
+    env, options = forest(max_episode_steps=4), {"scale_init": 0.3, "return_log_prob": True}
+    make = make_actor if kind == "blind" else functools.partial(actor_for, recurrent=kind == "remembering")
+    actor, white = make(env, noise_correlation=0.9, **options), make(env, **options)
     white.load_state_dict(actor.state_dict())
     rollout, _ = differentiable_rollout(env, actor, None, 6)
     rollout, rest = rollout.detach(), math.sqrt(1 - 0.9**2)
@@ -225,6 +228,8 @@ def test_correlated_noise_of_a_policy_that_sees_is_that_of_its_head(recurrent):
     torch.testing.assert_close(rollout["scale"], free["scale"] * rest)
     torch.testing.assert_close(rollout["loc"], free["loc"] + 0.9 * free["scale"] * rollout["noise_before"])
     torch.testing.assert_close(rollout["action"], torch.tanh(free["loc"] + free["scale"] * rollout["noise"]))
+    density = TransformedDistribution(Normal(rollout["loc"], rollout["scale"]), TanhTransform())
+    torch.testing.assert_close(rollout["action_log_prob"], density.log_prob(rollout["action"]).sum(-1))
     loss = ClipPPOLoss(actor, make_value(env), entropy_bonus=False)
     assert "noise_before" in loss.in_keys
     rollout["advantage"] = rollout["value_target"] = torch.ones(3, 6, 1)

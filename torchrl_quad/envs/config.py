@@ -17,7 +17,7 @@ from torchrl_quad.envs.any_drone import any_drone
 from torchrl_quad.envs.disturbances import Disturbance, DroneRandomization, RandomStart, Sensors, Wind
 from torchrl_quad.envs.scenes import MountedCamera, Scene
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
-from torchrl_quad.options import Explained, accepted, between, build, buildable, check_value, explained, imported
+from torchrl_quad.options import accepted, between, build, buildable, check_value, explained, imported
 from torchrl_quad.vision import DepthCamera
 
 # A larger weight would leave none of the seven digits of single precision to the others.
@@ -28,17 +28,6 @@ def _dynamics(value: object) -> object:
     if not (isinstance(value, str) and value in DYNAMICS):  # users add to DYNAMICS
         raise UserValueError(f"be one of {', '.join(DYNAMICS)}")
     return value
-
-
-def _weights(weights: object) -> object:
-    if not isinstance(weights, Mapping | None):
-        raise UserValueError("be a mapping from terms of the reward to numbers")
-    for name, value in (weights or {}).items():
-        try:
-            check_value(str(name), value, Weight)
-        except UserValueError as error:
-            raise Explained(str(error)) from None
-    return weights
 
 
 FloatType = Annotated[
@@ -64,7 +53,11 @@ RandomizeOption = Annotated[
 DisturbancesOption = Annotated[Any, AfterValidator(lambda value: as_disturbances(value) and value)]
 SceneOption = Annotated[Any, explained(Scene.of, "scene")]
 CameraOption = Annotated[Any, buildable(DepthCamera, "camera")]
-WeightsOption = Annotated[Any, AfterValidator(_weights)]
+WeightsOption = Annotated[
+    Any,
+    accepted(lambda x: isinstance(x, Mapping | None), "a mapping from terms of the reward to numbers"),
+    explained(lambda weights: [check_value(str(name), x, Weight) for name, x in weights.items()], "weights"),
+]
 
 
 def as_disturbances(value: Any, setting: str = "disturbances") -> list[Disturbance]:

@@ -7,6 +7,7 @@ import errno
 import functools
 import itertools
 import os
+import re
 import socket
 import sys
 import traceback
@@ -23,7 +24,7 @@ import torch.distributed as dist
 import yaml
 from filelock import Timeout
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
+from hydra.errors import ConfigCompositionException, HydraException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
@@ -108,7 +109,7 @@ def recipe(config: str, **settings: Any) -> Callable[[Callable[[DictConfig], Non
             try:
                 with _explained():
                     sys.argv[1:] = command_line(sys.argv[1:])
-                job()
+                _run(job)
             except (Refused, RefusedInSweep) as error:
                 _end(error, 2, full)
             except KeyboardInterrupt as error:
@@ -123,6 +124,20 @@ def recipe(config: str, **settings: Any) -> Callable[[Callable[[DictConfig], Non
         return program
 
     return decorate
+
+
+def _run(job: Callable[[], None]) -> None:
+    """Run hydra's job. A setting that the files lack is added: the schema takes it, as env.weights.position, or says
+    why it does not."""
+    while True:
+        try:
+            return job()
+        except ConfigCompositionException as error:
+            lacking = re.match(r"Could not override '(.+?)'\.", str(error))
+            known = [f"+{x}" if lacking and x.startswith(f"{lacking[1]}=") else x for x in sys.argv[1:]]
+            if known == sys.argv[1:]:
+                raise
+            sys.argv[1:] = known
 
 
 def _end(error: BaseException, status: int, full: bool) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 from torch.func import jacfwd
+from torch.nn.functional import one_hot
 
 from torchrl_quad.identification.parameters import UNKNOWNS, Model
 from torchrl_quad.identification.prediction import Windows, differences, states_at
@@ -124,7 +125,7 @@ def minimise(problem: Problem, state: State, report: Callable[[State], None], ma
         linear = problem.linearise(state, update_scale=state.iteration < 8)
         state.scale = problem.scale.tolist()
         state.cost = problem.cost(state)
-        hessian, gradient = normal_equations(linear, problem.windows.log, len(state.streams))
+        hessian, gradient = (x.sum(0) for x in per_window(linear, problem.windows.log, len(state.streams)))
         before = state
         for _ in range(8):
             state = _moved(before, _solve(hessian, gradient, before.damping), problem.model)
@@ -146,24 +147,12 @@ def minimise(problem: Problem, state: State, report: Callable[[State], None], ma
     return state
 
 
-def normal_equations(linear: Linear, log: Tensor, logs: int) -> tuple[Tensor, Tensor]:
-    """Hessian (n + L, n + L) and gradient (n + L) of all windows, with a stream delay for each log."""
-    h, g = per_window(linear)
-    n = linear.jacobian.shape[-1] - 1
-    hessian, gradient = h.new_zeros(n + logs, n + logs), g.new_zeros(n + logs)
-    hessian[:n, :n], gradient[:n] = h[:, :n, :n].sum(0), g[:, :n].sum(0)
-    for k in range(logs):
-        own = log == k
-        hessian[:n, n + k] = hessian[n + k, :n] = h[own, :n, n].sum(0)
-        hessian[n + k, n + k], gradient[n + k] = h[own, n, n].sum(), g[own, n].sum()
-    return hessian, gradient
-
-
-def per_window(linear: Linear) -> tuple[Tensor, Tensor]:
-    """Hessian (W, n + 1, n + 1) and gradient (W, n + 1) of each window."""
-    weighted = linear.jacobian * linear.weight.unsqueeze(-1)
-    hessian = weighted.transpose(1, 2) @ linear.jacobian
-    return hessian, (weighted * linear.residual.unsqueeze(-1)).sum(1)
+def per_window(linear: Linear, log: Tensor, logs: int) -> tuple[Tensor, Tensor]:
+    """Hessian (W, n + L, n + L) and gradient (W, n + L) of each window; of the stream delays only its log's counts."""
+    coordinates, stream = linear.jacobian[..., :-1], linear.jacobian[..., -1:]
+    jacobian = torch.cat((coordinates, stream * one_hot(log, logs).unsqueeze(1)), -1)
+    weighted = jacobian * linear.weight.unsqueeze(-1)
+    return weighted.transpose(1, 2) @ jacobian, (weighted * linear.residual.unsqueeze(-1)).sum(1)
 
 
 def covariance(linear: Linear, log: Tensor, logs: int, lags: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -172,9 +161,8 @@ def covariance(linear: Linear, log: Tensor, logs: int, lags: int) -> tuple[Tenso
     It is a sandwich: windows that follow each other err alike, since the air, the battery and the model's own faults
     stay, so the scores of windows up to ``lags`` apart are summed (Newey and West 1987).
     """
-    hessian, _ = normal_equations(linear, log, logs)
-    _, g = per_window(linear)
-    scores = g.new_zeros(len(g), g.shape[1] - 1 + logs).scatter(1, _places(g, log), g)
+    hessians, scores = per_window(linear, log, logs)
+    hessian = hessians.sum(0)
     bread = _inverse(hessian)
     meat = scores.T @ scores
     for lag in range(1, lags + 1):
@@ -182,32 +170,24 @@ def covariance(linear: Linear, log: Tensor, logs: int, lags: int) -> tuple[Tenso
         part = (scores[lag:] * same).T @ scores[:-lag]
         meat += (1.0 - lag / (lags + 1.0)) * (part + part.T)
     used = int((hessian.diag() > 0).sum())
-    correction = len(g) / max(len(g) - used, 1)
+    correction = len(scores) / max(len(scores) - used, 1)
     return correction * bread @ meat @ bread, bread, scores
 
 
 def bootstrap(linear: Linear, log: Tensor, logs: int, block: int, draws: int, seed: int) -> Tensor:
     """Changes of the unknowns (draws, n + L) where blocks of windows are resampled, with one Gauss-Newton step each."""
-    h, g = per_window(linear)
-    size, place, index = g.shape[1] - 1 + logs, _places(g, log), torch.arange(len(g))
-    scores, hessians = g.new_zeros(len(g), size).scatter(1, place, g), g.new_zeros(len(g), size, size)
-    hessians[index[:, None, None], place[:, :, None], place[:, None, :]] = h
+    hessians, scores = per_window(linear, log, logs)
+    count = len(scores)
     generator = torch.Generator().manual_seed(seed)
-    blocks = -(-len(g) // block)
+    blocks = -(-count // block)
     changes = []
     for _ in range(draws):
-        first = torch.randint(len(g), (blocks,), generator=generator)
-        drawn = ((first[:, None] + torch.arange(block)) % len(g)).flatten()[: len(g)]
-        counts = torch.bincount(drawn, minlength=len(g)).to(g)
+        first = torch.randint(count, (blocks,), generator=generator)
+        drawn = ((first[:, None] + torch.arange(block)) % count).flatten()[:count]
+        counts = torch.bincount(drawn, minlength=count).to(scores)
         hessian = (counts[:, None, None] * hessians).sum(0)
         changes.append(-_inverse(hessian) @ (counts[:, None] * scores).sum(0))
     return torch.stack(changes)
-
-
-def _places(gradient: Tensor, log: Tensor) -> Tensor:
-    """Which unknowns (W, n + 1) of all (n + L) a window has: the coordinates, and its log's stream delay."""
-    n = gradient.shape[1] - 1
-    return torch.cat((torch.arange(n).expand(len(log), n), (n + log).unsqueeze(1)), 1)
 
 
 def _solve(hessian: Tensor, gradient: Tensor, damping: float) -> Tensor:

@@ -32,7 +32,6 @@ from torchrl_quad.deploy.folding import fold
 from torchrl_quad.deploy.judging import judge
 from torchrl_quad.deploy.network import write_c, write_onnx
 from torchrl_quad.deploy.tracing import Rules, trace
-from torchrl_quad.engine.packing import Key
 from torchrl_quad.envs import QuadrotorEnv
 from torchrl_quad.errors import MissingPackage, UserValueError
 from torchrl_quad.files import check_place, replacing_folder
@@ -103,7 +102,7 @@ def export_policy(
     first, whole, replayed, chosen = _fly(task, policy, count)
     vectors = _vectors(policy, task, chosen)
     n = 3 if task.num_envs != 3 else 4  # rules that only work for the environment's own number do not trace
-    states = {key: leaf(replayed, _below("state", key)).flatten(0, 1)[:n] for key in task.control_step.safe_state}
+    states = {key: leaf(replayed, ("state", key)).flatten(0, 1)[:n] for key in task.control_step.safe_state}
     rules = trace(task, states)
     models = {"policy": write_onnx(network), **rules.graphs}
     package = "torchrl_quad"
@@ -122,7 +121,7 @@ def export_policy(
         },
     }
     keys = {name: name for name in MEASURED} | rules.entries | rules.obstacles
-    starts = {name: _array(leaf(first, _below("state", key))) for name, key in keys.items()}
+    starts = {name: _array(leaf(first, ("state", key))) for name, key in keys.items()}
     files = {f"{name}.onnx": x.SerializeToString(deterministic=True) for name, x in models.items()}
     files |= {"vectors.npz": _npz(vectors), "starts.npz": _npz(starts)}
     files["README.md"] = write_page(contract, type(task).__doc__)
@@ -211,7 +210,7 @@ def _vectors(policy: TensorDictModuleBase, env: QuadrotorEnv, chosen: TensorDict
     vectors = {name: seen[name] for name in ("observation", "depth") if name in seen}
     vectors |= {"memory": seen[memory[0]].flatten(1)} if memory else {}
     vectors |= {"action": leaf(acted, "action")}
-    vectors |= {"next_memory": leaf(acted, _below("next", cast(Key, memory[0]))).flatten(1)} if memory else {}
+    vectors |= {"next_memory": leaf(acted, ("next", memory[0])).flatten(1)} if memory else {}
     return {name: _array(x.float()) for name, x in vectors.items()}
 
 
@@ -227,7 +226,7 @@ def _check_the_flight(
         done = leaf(flight, ("next", "done")).flatten()
         length = int(done.nonzero()[0]) + 1 if done.any() else len(done)
         episode = flight[:length]
-        seen = true = {key: leaf(episode, _below("state", key)) for key in env.control_step.safe_state}
+        seen = true = {key: leaf(episode, ("state", key)) for key in env.control_step.safe_state}
         for disturbance in env.disturbances.values():
             seen = disturbance.observe(seen)
         states = {name: _array(seen[name]) for name in MEASURED}
@@ -267,7 +266,7 @@ def _check_the_flight(
         before, after = (leaf(flights, key) for key in (("state", name), ("next", "state", name)))
         flown[name] = _array(torch.cat((before[:, :1], after), 1))
     starts = rules.entries | rules.obstacles
-    flown |= {name: _array(leaf(flights, _below("state", key))[:, 0]) for name, key in starts.items()}
+    flown |= {name: _array(leaf(flights, ("state", key))[:, 0]) for name, key in starts.items()}
     expected = env.episode_metrics(flights)
     for name, found in judge(bundle, flown).items():
         own = _array(expected[name])
@@ -276,10 +275,6 @@ def _check_the_flight(
                 f"export_policy: the bundle judges flights differently from {task}: {name} is {found.tolist()} instead "
                 f"of {own.tolist()}. is_crash, is_success, advance, metrics and episode_metrics {how}"
             )
-
-
-def _below(group: str, key: Key) -> tuple[str, ...]:
-    return (group, key) if isinstance(key, str) else (group, *key)
 
 
 def _array(x: Tensor) -> np.ndarray:

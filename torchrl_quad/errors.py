@@ -5,7 +5,8 @@ The recipes end in one line for these; every other error is a mistake of a progr
 
 import reprlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 
@@ -35,6 +36,15 @@ class Diverged(UserError, FloatingPointError):
 
 class MissingPackage(UserError, ImportError):
     """An optional package is not installed."""
+
+
+@contextmanager
+def needing(message: str, kind: type[Exception] = MissingPackage) -> Iterator[None]:
+    """Say what to install where an import in this block fails."""
+    try:
+        yield
+    except ImportError as error:
+        raise kind(message) from error
 
 
 class DroneWarning(UserWarning):

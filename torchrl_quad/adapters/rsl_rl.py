@@ -10,12 +10,10 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_quad.adapters.torch_vector import TorchVectorEnv
-from torchrl_quad.errors import MissingPackage, UserTypeError, UserValueError
+from torchrl_quad.errors import UserTypeError, UserValueError, needing
 
-try:
+with needing('RslRlVecEnv needs rsl-rl: pip install ".[adapters]" in a clone'):
     from rsl_rl.env import VecEnv
-except ImportError as error:
-    raise MissingPackage('RslRlVecEnv needs rsl-rl: pip install ".[adapters]" in a clone') from error
 
 
 class RslRlVecEnv(VecEnv):

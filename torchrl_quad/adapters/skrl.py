@@ -9,12 +9,10 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_quad.adapters.torch_vector import TorchVectorEnv
-from torchrl_quad.errors import MissingPackage
+from torchrl_quad.errors import needing
 
-try:
+with needing('SkrlEnv needs skrl: pip install ".[adapters]" in a clone'):
     from skrl.envs.wrappers.torch import Wrapper
-except ImportError as error:
-    raise MissingPackage('SkrlEnv needs skrl: pip install ".[adapters]" in a clone') from error
 
 
 class SkrlEnv(Wrapper):

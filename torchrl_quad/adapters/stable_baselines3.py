@@ -10,13 +10,11 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from torchrl_quad.adapters.gym import check_action, check_options
-from torchrl_quad.errors import MissingPackage, Unsupported, UserTypeError, UserValueError, WrongState
+from torchrl_quad.errors import Unsupported, UserTypeError, UserValueError, WrongState, needing
 from torchrl_quad.options import Seed, check_value
 
-try:
+with needing('DronesVecEnv needs stable-baselines3: pip install ".[adapters]" in a clone'):
     from stable_baselines3.common.vec_env import VecEnv
-except ImportError as error:
-    raise MissingPackage('DronesVecEnv needs stable-baselines3: pip install ".[adapters]" in a clone') from error
 
 
 class DronesVecEnv(VecEnv):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_quad.airframe import contradictions, matrix, uncontrolled
-from torchrl_quad.errors import MissingPackage, UserError, UserValueError, one_line, shown
+from torchrl_quad.errors import UserError, UserValueError, needing, one_line, shown
 
 VERSION = 5  # of the contract; raise it when a reader of the older one would misunderstand the new one
 GRAPHS = ("policy", "observe", "advance", "judge", "episode")  # the ONNX files that a bundle may have
@@ -138,10 +138,8 @@ def drone_problem(contract: Contract) -> str | None:
 
 def _misfits(value: Any, part: str | None = None, at: str = "") -> Iterator[str]:
     """Where a contract, or a part of it, which stands at another place, does not fit the schema."""
-    try:
+    with needing("A bundle is checked with jsonschema: pip install jsonschema"):
         from jsonschema import Draft202012Validator
-    except ImportError as error:
-        raise MissingPackage("A bundle is checked with jsonschema: pip install jsonschema") from error
     rules = schema() if part is None else schema()["properties"][part]
     for error in Draft202012Validator(rules).iter_errors(value):
         place = f"{at}{error.json_path.removeprefix('$')}".removeprefix(".") or "it"

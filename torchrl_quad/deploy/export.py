@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import json
 import os
@@ -33,7 +34,7 @@ from torchrl_quad.deploy.judging import judge
 from torchrl_quad.deploy.network import write_c, write_onnx
 from torchrl_quad.deploy.tracing import Rules, trace
 from torchrl_quad.envs import QuadrotorEnv
-from torchrl_quad.errors import MissingPackage, UserValueError
+from torchrl_quad.errors import UserValueError, needing
 from torchrl_quad.files import check_place, replacing_folder
 
 VECTORS, SELF_TEST_VECTORS = 1024, 16
@@ -80,13 +81,10 @@ def export_policy(
         FileExistsError: something else than a bundle has that name, or there are files beside a bundle.
         ImportError: onnx, onnxruntime or onnxscript is missing.
     """
-    try:  # before anything flies
-        import onnx  # noqa: F401
-        import onnxruntime  # noqa: F401
-        import onnxscript  # noqa: F401, which torch.onnx needs
-    except ImportError as error:
-        needed = "onnx onnxruntime onnxscript"
-        raise MissingPackage(f"export_policy needs {needed}: pip install {needed}") from error
+    needed = "onnx onnxruntime onnxscript"  # of which torch.onnx needs the last
+    with needing(f"export_policy needs {needed}: pip install {needed}"):  # before anything flies
+        for package in needed.split():
+            importlib.import_module(package)
     task, normalizer = _unwrapped(env, normalizer)
     place = Path(folder) if Path(folder).name not in ("", "..") else Path(folder).resolve()
     check_place(place, "folder")

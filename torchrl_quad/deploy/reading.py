@@ -21,7 +21,7 @@ from torchrl_quad.deploy.contract import (
     problem,
     sha256,
 )
-from torchrl_quad.errors import MissingPackage, one_line, shown
+from torchrl_quad.errors import needing, one_line, shown
 
 AGAIN = "Export the policy again."
 
@@ -40,10 +40,8 @@ class Graph:
     """
 
     def __init__(self, path: Path, content: bytes, about: Contract) -> None:
-        try:
+        with needing("A bundle flies with onnxruntime: pip install onnxruntime"):
             import onnxruntime
-        except ImportError as error:
-            raise MissingPackage("A bundle flies with onnxruntime: pip install onnxruntime") from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 4

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_quad.errors import UserError, one_line
+from torchrl_quad.errors import UserError, needing, one_line
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog, WrongMotors
 from torchrl_quad.identification.layouts import (
     BY_IMU,
@@ -38,11 +38,9 @@ def read_bag(path: Path, columns: Asked) -> tuple[list[Stream], Layout, list[str
     the clock of other stamps. By default topics are found by their types, in the convention of ROS (z up, body FLU,
     x y z w) with motors in our order.
     """
-    try:
+    with needing("A ROS bag needs rosbags. Write: pip install '.[logs]' in a clone.", UnreadableLog):
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
-    except ModuleNotFoundError as error:
-        raise UnreadableLog("A ROS bag needs rosbags. Write: pip install '.[logs]' in a clone.") from error
     for part in [x for x in path.iterdir() if not x.is_dir()] if path.is_dir() else [path]:
         open_plain(part).close()
     try:

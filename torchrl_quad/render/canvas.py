@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchrl_quad.envs.markers import Markers
-from torchrl_quad.errors import MissingPackage
+from torchrl_quad.errors import needing
 from torchrl_quad.files import replacing
 
 if TYPE_CHECKING:
@@ -25,11 +25,9 @@ INK, BLUE, RED, GREEN = "#222222", "#2f6db5", "#c8452f", "#3a7d4f"
 
 def make_figure(**options: Any) -> Figure:
     """A matplotlib figure that needs no screen, leaves the user's backend alone, and shows itself in a notebook."""
-    try:
+    with needing("Pictures need matplotlib: pip install '.[render]' in a clone."):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingPackage("Pictures need matplotlib: pip install '.[render]' in a clone.") from error
     figure = Figure(**options)
     FigureCanvasAgg(figure)
     vars(figure)["_repr_png_"] = partial(_png, figure)  # notebooks show only figures of pyplot without it

@@ -19,7 +19,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_quad.dynamics import QuadrotorParams
 from torchrl_quad.envs.metrics import at_episode_end
-from torchrl_quad.errors import MissingPackage, UserValueError
+from torchrl_quad.errors import UserValueError, needing
 from torchrl_quad.files import replacing
 from torchrl_quad.options import Positive, Size, checked
 from torchrl_quad.render.flights import Flight, depth_image, obstacle_shapes
@@ -70,10 +70,8 @@ def write_replay(
         env: the environment that flew, also under transforms. Without it, the page shows an X frame and the squared
             speed of each rotor.
     """
-    try:
+    with needing("Replays need plotly: pip install '.[render]' in a clone."):
         from plotly.offline import get_plotlyjs
-    except ImportError as error:
-        raise MissingPackage("Replays need plotly: pip install '.[render]' in a clone.") from error
     needed = [("next", "state", name) for name in ("position", "quaternion")]
     flight = Flight("write_replay", rollout, env, control_dt, needed, num_envs)
     content = json.dumps(_content(flight), default=_encoded)

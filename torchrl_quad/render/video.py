@@ -23,7 +23,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs.markers import Markers
-from torchrl_quad.errors import MissingPackage, UserValueError, one_line
+from torchrl_quad.errors import MissingPackage, UserValueError, needing, one_line
 from torchrl_quad.files import replacing
 from torchrl_quad.options import Positive, Size, checked
 from torchrl_quad.render import canvas
@@ -188,10 +188,8 @@ def _write_gif(path: Path, frames: Iterator[np.ndarray], times: np.ndarray) -> N
 
 def _write_mp4(path: Path, frames: Iterator[np.ndarray], times: np.ndarray) -> None:
     """The same in equal intervals: the last frame, of the end, may come later than its time by less than one."""
-    try:
+    with needing("Films in MP4 need imageio-ffmpeg: pip install '.[render]' in a clone.", NoFfmpeg):
         from imageio_ffmpeg import get_ffmpeg_exe
-    except ImportError as error:
-        raise NoFfmpeg("Films in MP4 need imageio-ffmpeg: pip install '.[render]' in a clone.") from error
     first, rate = next(frames), Fraction(1.0 / (times[-1] - times[-2])).limit_denominator()
     source = f"-f rawvideo -pix_fmt rgb24 -s {first.shape[1]}x{first.shape[0]} -r {rate} -i -".split()
     target = ["-an", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-movflags", "+faststart", "-f", "mp4"]

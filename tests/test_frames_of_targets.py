@@ -5,6 +5,7 @@ import struct
 import numpy as np
 import pytest
 from refusals import cases, refuses
+from scipy.spatial.transform import Rotation
 
 from torchrl_quad.deploy import frames
 
@@ -49,14 +50,7 @@ def test_an_attitude_turns_vectors_as_the_target_would(target):
 
 
 def turned(q, v):
-    """v turned by the unit quaternion (w, x, y, z), from the textbook's matrix."""
-    w, x, y, z = q
-    matrix = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.array(matrix) @ v
+    return Rotation.from_quat(q, scalar_first=True).apply(v)
 
 
 def assert_to(target, name, ours, theirs):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import html
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from torchrl_quad.adaptation.adapting import Adaptation
 from torchrl_quad.adaptation.fit import UNKNOWNS, FlightFit
 from torchrl_quad.files import replacing
 from torchrl_quad.identification import FlightLog
-from torchrl_quad.render.canvas import BLUE, INK, RED, make_figure
+from torchrl_quad.render.canvas import BLUE, INK, RED, make_figure, png
 
 _NAMES = [f"{name} {x}" for name, what in zip(UNKNOWNS, ("0123", "xyz", "xy", "xy"), strict=True) for x in what]
 _STYLE = "body{font:16px/1.5 sans-serif;max-width:56em;margin:2em auto;color:#222}td,th{padding:.1em 1em .1em 0}"
@@ -70,9 +69,7 @@ def _table(before: str, after: str, rows: Sequence[tuple[str, float, float]]) ->
 
 
 def _image(figure: Any, caption: str) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    picture = base64.b64encode(buffer.getvalue()).decode()
+    picture = base64.b64encode(png(figure, dpi=110)).decode()
     return f'<p><img alt="{caption}" src="data:image/png;base64,{picture}"><br>{caption}.'
 
 

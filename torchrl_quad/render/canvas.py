@@ -30,13 +30,14 @@ def make_figure(**options: Any) -> Figure:
         from matplotlib.figure import Figure
     figure = Figure(**options)
     FigureCanvasAgg(figure)
-    vars(figure)["_repr_png_"] = partial(_png, figure)  # notebooks show only figures of pyplot without it
+    vars(figure)["_repr_png_"] = partial(png, figure)  # notebooks show only figures of pyplot without it
     return figure
 
 
-def _png(figure: Figure) -> bytes:
+def png(figure: Figure, dpi: int = 100) -> bytes:
+    """A figure as the content of a PNG."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=100)
+    figure.savefig(buffer, format="png", dpi=dpi)
     return buffer.getvalue()
 
 

@@ -98,7 +98,7 @@ class Residual(nn.Module):
 def learn(logs: list[FlightLog], drone: QuadrotorParams, steps: int) -> Residual:
     """Train the network on half a second of prediction, on top of a fitted drone."""
     torch.manual_seed(0)
-    windows = cut(logs, 0.5, PAST, 0.1, stride=2)
+    windows = cut(logs, 0.5, PAST, 0.1, step=0.02)
     late = torch.tensor([stream_delay(log) for log in logs], dtype=torch.float64)
     network = Residual(plant_of(drone, drone.motor_command, late[windows.log]))
     optimizer = torch.optim.Adam(network.parameters(), 3e-3, weight_decay=1e-5)

@@ -148,7 +148,7 @@ def test_the_jacobian_of_a_fit_is_that_of_central_differences(real):
     prior = load_drone("crazyflie", torch.float64)
     free = tuple(name for name in UNKNOWNS if name != "stream")
     model = Model(prior, prior.motor_command, free)
-    short = prediction.cut([real], 0.3, 0.1, 4.0, 2, prior.motor_command.nominal_voltage)
+    short = prediction.cut([real], 0.3, 0.1, 4.0, 0.02, prior.motor_command.nominal_voltage)
     problem = fitting.Problem(model, short, moves_streams=True, counts_push=True)
     x = model.start + 0.1 * torch.randn(len(free), dtype=torch.float64)  # where two time constants are two
     streams = torch.tensor([prediction.stream_delay(real)], dtype=torch.float64)

@@ -97,11 +97,9 @@ def identify(
     moves_streams = "stream" in unknowns and any("angular_velocity" in x.onboard for x in logs)
     if not wanted and not moves_streams:
         raise UserValueError("identify: nothing is left to fit, since all of the fields are known. Name more fields.")
-    step = min(x.dt * max(1, round(0.01 / x.dt)) for x in logs)
     seconds = sum((b - a) * x.dt for x in logs for a, b in x.segments)
     every = max(0.5 * horizon, seconds / _MOST_WINDOWS)
-    stride = max(1, round(_BODY_STEP / step))
-    windows = prediction.cut(logs, horizon, past, every, stride, motors.nominal_voltage)
+    windows = prediction.cut(logs, horizon, past, every, _BODY_STEP, motors.nominal_voltage)
     held = held_out(windows)
     kept = windows.select(torch.nonzero(~held).flatten())
     if len(kept) < 2 * len(wanted) + 4:

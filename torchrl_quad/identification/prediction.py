@@ -319,10 +319,11 @@ def states_at(states: RigidBodyState, steps: int | Tensor) -> RigidBodyState:
 
 
 def cut(
-    logs: Sequence[FlightLog], future: float, past: float, every: float, stride: int = 1, nominal_voltage: float = 1.0
+    logs: Sequence[FlightLog], future: float, past: float, every: float, step: float = 0.0, nominal_voltage: float = 1.0
 ) -> Windows:
     """Windows of length ``future``, one ``every`` so often [s]; each lies in one piece of flight, with its ``past`` [s]
-    and room for delays. ``nominal_voltage`` [V] is of a battery that is not in the log."""
+    and room for delays. The body moves in steps of about ``step`` [s], of a sample at least. ``nominal_voltage`` [V] is
+    of a battery that is not in the log."""
     dt = min(log.dt * max(1, round(SAMPLE / log.dt)) for log in logs)
     columns, starts, owners = [], [], []
     n_past, n_future = round(past / dt), round(future / dt)
@@ -348,7 +349,7 @@ def cut(
     motion, rate, command = stacked.split((10, 3, 4), -1)
     lagging = torch.tensor([float("angular_velocity" in log.onboard) for log in logs], dtype=torch.float64)
     log, start = torch.from_numpy(np.concatenate(owners)), torch.from_numpy(np.concatenate(starts))
-    return Windows(motion, rate, command, lagging, log, start, dt, n_past, n_future, stride)
+    return Windows(motion, rate, command, lagging, log, start, dt, n_past, n_future, max(1, round(step / dt)))
 
 
 def stream_delay(log: FlightLog) -> float:

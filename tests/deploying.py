@@ -106,6 +106,17 @@ def measured(bundle, **changes):
     return resting(**images | changes)
 
 
+def contract_of(drone, dynamics="quadrotor", dt=0.001):
+    """What simulators read of a contract: of a drone by its fields, whose policy commands rates."""
+    body_rate, thrust = [[-x, x] for x in drone["max_body_rate"]], [0.0, 9.81]
+    output = {"control": "rates", "gains": {}, "range": [thrust, *body_rate]}
+    output |= {"body_rate": {"range": body_rate}, "thrust": {"range": thrust}}
+    simulator = {"dynamics": dynamics, "dt": dt, "integrator": "semi_implicit_euler"}
+    about = {"drone": drone, "plant": {}, "control_dt": 0.02, "rate_loop": {}, "simulator": simulator}
+    about |= {"camera": None, "obstacles": None, "output": output}
+    return {**about, "task": {"name": "racing", "unjudged": ""}, "origin": {"package": "torchrl_quad"}}
+
+
 def rules_of(env, _, folder):
     """The rules in a bundle, of an environment and its policy."""
     about = json.loads((folder / "contract.json").read_text())

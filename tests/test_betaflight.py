@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from deploying import contract_of
 from refusals import cases, refuses
 from small_runs import ROOT
 
@@ -27,21 +28,7 @@ CLOCK = resources.files("torchrl_quad.deploy") / "templates" / "betaflight.c"
 def contract(drone="small_racer", **changes):
     fields = yaml.safe_load((PRESETS / f"{drone}.yaml").read_text()) | changes
     fields.pop("motor_command", None)
-    simulator = {"dynamics": "betaflight", "dt": 0.0025, "integrator": "semi_implicit_euler"}
-    about = {
-        "drone": fields,
-        "plant": {},
-        "camera": None,
-        "obstacles": None,
-        "control_dt": 0.02,
-        "rate_loop": {},
-        "simulator": simulator,
-    }
-    ranges = {"body_rate": {"range": [[-x, x] for x in fields["max_body_rate"]]}, "thrust": {"range": [0.0, 9.81]}}
-    every = [ranges["thrust"]["range"], *ranges["body_rate"]["range"]]
-    about["output"] = {"control": "rates", "gains": {}, "range": every, **ranges}
-    about |= {"camera": None, "obstacles": None}
-    return {**about, "task": {"name": "racing", "unjudged": ""}, "origin": {"package": "torchrl_quad"}}
+    return contract_of(fields, "betaflight", 0.0025)
 
 
 def numbers(text, separator):

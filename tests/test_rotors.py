@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from deploying import contract_of
 from flying import fly, hold
 from log_writers import END, TABLE, flight, ned, own_table, write_csv
 from refusals import cases, refuses
@@ -254,18 +255,8 @@ def fields(params):
 @pytest.mark.parametrize("name", ["hexarotor", "coaxial", "tilted hexarotor"])
 def test_a_drone_of_a_contract_flies_in_mujoco_as_in_the_package_also_with_a_dead_rotor(name):
     pytest.importorskip("mujoco")
-    simulator = {"dt": 0.001, "dynamics": "quadrotor", "integrator": "semi_implicit_euler"}
-    flown = {
-        "control_dt": 0.02,
-        "simulator": simulator,
-        "origin": {"package": ""},
-        "task": {"name": "", "unjudged": ""},
-        "output": {"control": "rates", "gains": {}, "range": [[0, 9], [-6, 6]], "thrust": {"range": [0, 9]}},
-        "obstacles": None,
-    }
-    flown["output"]["body_rate"] = {"range": 3 * [[-6, 6]]}
     plant = {"rotor_effectiveness": [0.0, *[1.0] * (len(LAYOUTS[name]["rotor_spin"]) - 1)]}
-    flown |= {"camera": None, "drone": fields(drone(name)), "plant": plant}
+    flown = contract_of(fields(drone(name))) | {"plant": plant}
     start = {"position": np.zeros((1, 3)), "quaternion": np.eye(4)[:1], "velocity": np.zeros((1, 3))}
     start["angular_velocity"] = np.array([[0.5, -0.3, 0.2]])
     ends = []

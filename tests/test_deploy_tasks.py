@@ -349,12 +349,6 @@ def test_a_policy_whose_memory_amplifies_rounding_errors_is_exported(tmp_path, t
     assert export_policy(actor, env, tmp_path / "policy").is_dir()
 
 
-def test_a_blind_policy_with_memory_is_exported_and_flies(export_once):
-    folder = export_once("hovering, with memory")[2]
-    assert load_bundle(folder).memory.shape == (4,)
-    assert len(transfer.fly(folder, "torchrl_quad", episodes=4)["action"]) == 4
-
-
 def test_a_blind_policy_among_trees_is_judged_as_in_the_environment(export_once):
     bundle = load_bundle(export_once("forest, blind")[2])
     metrics = transfer.fly(bundle, "torchrl_quad")["metrics"]

@@ -49,16 +49,11 @@ class Ours(Simulator):
         self.now = {**self.dynamics.rest(given["position"]), **given}
 
     def place(self, obstacles: Mapping[str, Array]) -> None:
-        fixed, drawn = (
-            Primitives(
-                *(
-                    torch.tensor(np.asarray(x.get(kind, ())), dtype=torch.float32).reshape(n, -1, k)
-                    for kind, k in SIZES.items()
-                )
-            )
-            for n, x in ((1, self.fixed or {}), (len(self.now["position"]), obstacles))
-        )
-        self.solids = join(fixed, drawn)
+        def solids(n: int, given: Mapping[str, Any]) -> Primitives:
+            kinds = (np.array(given.get(kind, ()), np.float32).reshape(n, -1, k) for kind, k in SIZES.items())
+            return Primitives(*map(torch.from_numpy, kinds))
+
+        self.solids = join(solids(1, self.fixed or {}), solids(len(self.now["position"]), obstacles))
 
     def look(self) -> Array:
         fields = {name: x for name, x in self.camera.items() if name not in ("rate", "delay", "noise", "dropout")}

@@ -319,11 +319,9 @@ def write_page(contract: Contract, documentation: str | None) -> bytes:
     """The content of ``README.md``, with the documentation of the class of the task."""
     task, output, graphs = contract["task"], contract["output"], contract["graphs"]
     reads = [(name, f"{x['shape']} {x.get('unit', '')}") for name, x in graphs["policy"]["reads"].items()]
-    columns = ("dtype", "unit", "frame")
     tensors = [
-        f"| `{graph}.onnx` | {side} | `{name}` | {'x'.join(map(str, x['shape'])) or '1'} | "
-        + " | ".join(x.get(column, "") for column in columns)
-        + " |"
+        f"| `{graph}.onnx` | {side} | `{name}` | {'x'.join(map(str, x['shape'])) or '1'} | {x['dtype']} "
+        f"| {x.get('unit', '')} | {x.get('frame', '')} |"
         for graph, sides in graphs.items()
         for side in ("reads", "writes")
         for name, x in sides[side].items()
@@ -372,9 +370,6 @@ def write_page(contract: Contract, documentation: str | None) -> bytes:
         values["camera_age"] = f"{contract['limits']['max_depth_age']:g}"
         ray, axis = "the length of its ray to", "the depth, along the optical axis, of"
         values["camera_pixel"] = ray if camera["along_ray"] else axis
-    features = [name for name in ("camera", "memory") if contract[name]]
-    features += ["autopilots"] if autopilots.fit(contract) else []
-    features += ["any"] if drawn else []
-    features += ["advance"] if "advance" in graphs else []
-    features += [] if task["unjudged"] else ["judged"]
-    return fill_in("README.md", values, features).encode()
+    has = {"camera": camera, "memory": contract["memory"], "autopilots": autopilots.fit(contract), "any": drawn}
+    has |= {"advance": "advance" in graphs, "judged": not task["unjudged"]}
+    return fill_in("README.md", values, [name for name, there in has.items() if there]).encode()

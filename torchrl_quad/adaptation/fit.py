@@ -250,12 +250,6 @@ def simulated_log(rollout: TensorDictBase, env: QuadrotorEnv, drone: int = 0) ->
     command = (wanted - motors.speed_at_zero) / (motors.speed_per_volt * motors.nominal_voltage)
     time: Any = env.control_dt * np.arange(steps)
     command = np.stack([np.interp(time + motors.delay, time, x) for x in command.T], 1).clip(0.0, 1.0)
-    state |= {"time": time, "motor_command": command[:, _of_rotors(params)], "segments": ((0, steps),)}
-    state |= {"acceleration": None, "battery_voltage": None, "setpoint": None}
+    state |= {"time": time, "segments": ((0, steps),), "acceleration": None, "battery_voltage": None, "setpoint": None}
+    state["motor_command"] = command[:, np.argsort(prediction.log_columns(params))]
     return FlightLog("simulated", **state, onboard=(), notes=("simulated",))
-
-
-def _of_rotors(params: QuadrotorParams) -> list[int]:
-    """The rotor of each column of a log."""
-    columns = prediction.log_columns(params)
-    return [columns.index(column) for column in range(4)]

@@ -141,8 +141,7 @@ def read_log(
             given = {name: value for name, value in {**options, **mended.changes}.items() if name in options}
             if "span" in mended.changes:
                 low, high = mended.changes["span"]
-                inside = [(stream.time >= low) & (stream.time <= high) for stream in moved]
-                moved = [stream.at(rows) for stream, rows in zip(moved, inside, strict=True)]
+                moved = [stream.at((stream.time >= low) & (stream.time <= high)) for stream in moved]
             return _read(path, moved, mended.layout, list(notes), **given)
 
         try:
@@ -187,16 +186,13 @@ def _read(
     notes.append(checks.check_order(at, signals, step, segments))
     setpoint = {q.removeprefix("setpoint."): x for q, x in at.items() if q.startswith("setpoint.")}
     present = {q.partition(".")[0] for q in at}
+    motion: Any = {q: at.get(q) for q in ("position", "quaternion", "velocity", "angular_velocity", "acceleration")}
     if "battery_voltage" not in at:
         notes.append("no battery voltage: the thrust of a command cannot be told from the charge of the battery")
     return FlightLog(
         name=path.name.removesuffix(".gz").rsplit(".", 1)[0] if path.is_file() else path.name,
         time=step * np.arange(len(grid), dtype=float),
-        position=at["position"],
-        quaternion=at["quaternion"],
-        velocity=at["velocity"],
-        angular_velocity=at["angular_velocity"],
-        acceleration=at.get("acceleration"),
+        **motion,
         motor_command=np.clip(at["motor_command"], 0.0, 1.0),
         battery_voltage=at["battery_voltage"][:, 0] if "battery_voltage" in at else None,
         setpoint={name: x[:, 0] if x.shape[-1] == 1 else x for name, x in setpoint.items()} or None,

@@ -367,11 +367,8 @@ def stream_delay(log: FlightLog) -> float:
     if len(index) < 10:
         return 0.0
     gyro = integral[span:] - integral[:-span]
-
-    def misfit(late: int) -> float:
-        return float(np.square(np.clip(turned[index] - gyro[index + late], -0.3, 0.3)).sum())
-
-    costs = np.array([misfit(late) for late in range(-reach, reach + 1)])
+    misfits = (turned[index] - gyro[index + late] for late in range(-reach, reach + 1))
+    costs = np.array([np.square(np.clip(misfit, -0.3, 0.3)).sum() for misfit in misfits])
     best = int(np.clip(costs.argmin(), 1, len(costs) - 2))
     left, low, right = costs[best - 1 : best + 2]
     curvature = left - 2.0 * low + right

@@ -15,7 +15,7 @@ const times = Float64Array.from({ length: frames }, (_, k) => flight.start + k *
 const RED = "#c8452f", ORANGE = "#e8912d", INK = "#222222", PALE = "#dcdfe3";
 const CURVES = [INK, "#2f6db5", "#e8912d", "#3a9a5b", "#c8452f", "#8a5fb0", "#8c6d4f", "#d17ba6", "#5bb0c0"];
 const RING = 33; // points around a gate
-let rings = ringsOf(null), shapes = shapesOf(null);
+let rings = allRings && own(allRings, null), shapes = own(allShapes, null);
 const TRAIL = Math.min(Math.round(2 / flight.control_dt), frames - 1); // steps behind a drone
 
 const everyone = Array.from({ length: environments }, (_, i) => i);
@@ -90,16 +90,10 @@ function drawTrail(pen, i, centre) {
   pen.lift();
 }
 
-// The gates of the environment that is followed, or else of the first; all may share those of the first.
-function ringsOf(i) {
-  const size = allRings ? allRings.length / flight.tracks : 0;
-  return allRings ? allRings.subarray(size * (flight.tracks > 1 ? i ?? 0 : 0)).subarray(0, size) : null;
-}
-
-// And the shapes around them.
-function shapesOf(i) {
-  const size = allShapes.length / flight.tracks;
-  return allShapes.slice(size * (flight.tracks > 1 ? i ?? 0 : 0)).slice(0, size);
+// Of all gates, or the shapes around them, those of the environment that is followed, or else of the first.
+function own(all, i) {
+  const size = all.length / flight.tracks, first = flight.tracks > 1 ? size * (i ?? 0) : 0; // which all may share
+  return all.slice(first, first + size);
 }
 
 const shapeTrace = (shape, k) => object({ ...shape, name: shape.name || `shape ${k}` });
@@ -188,14 +182,12 @@ function ground() {
   return line("ground", pen, "#e3e6e9", 1);
 }
 
-function line(name, { x, y, z }, color, width) {
-  return { name, type: "scatter3d", mode: "lines", x, y, z, line: { color, width }, hoverinfo: "skip" };
+function trace(name, mode, { x, y, z }, style) {
+  return { name, type: "scatter3d", mode, x, y, z, ...style, hoverinfo: "skip" };
 }
 
-function markers(name, { x, y, z }, color, symbol, markerSize) {
-  return { name, type: "scatter3d", mode: "markers", x, y, z, marker: { color, symbol, size: markerSize },
-    hoverinfo: "skip" };
-}
+const line = (name, pen, color, width) => trace(name, "lines", pen, { line: { color, width } });
+const markers = (name, pen, color, symbol, size) => trace(name, "markers", pen, { marker: { color, symbol, size } });
 
 // A pen that has gone through the points of an array.
 function through(array) {
@@ -210,8 +202,7 @@ function labels(name, words, objects) {
   for (const [[x0, y0, z0], [x1, y1, z1]] of objects.map((points) => bounds(points))) {
     pen.to([(x0 + x1) / 2, (y0 + y1) / 2, z1 + Math.max(0.15 * (z1 - z0), 0.02 * extent)]);
   }
-  return { name, type: "scatter3d", mode: "text", x: pen.x, y: pen.y, z: pen.z, text: words,
-    textfont: { color: "#777", size: 12 }, hoverinfo: "skip" };
+  return trace(name, "text", pen, { text: words, textfont: { color: "#777", size: 12 } });
 }
 
 function gates() {
@@ -429,22 +420,19 @@ function choose(i) {
   chosen = i;
   element("environment").value = i ?? "all";
   Plotly.restyle("space", { "line.color": [trailColors()] }, [indexOf("trail")]);
-  if (indexOf("course") >= 0) {
-    const { x, y, z } = course();
-    Plotly.restyle("space", { x: [x], y: [y], z: [z] }, [indexOf("course")]);
-  }
+  if (indexOf("course") >= 0) moveTrace(course());
   if (rings && flight.tracks > 1) {
-    [rings, shapes] = [ringsOf(i), shapesOf(i)];
-    for (const { name, x, y, z } of [...gates(), ...shapes.map(shapeTrace)]) {
-      Plotly.restyle("space", { x: [x], y: [y], z: [z] }, [indexOf(name)]);
-    }
+    [rings, shapes] = [own(allRings, i), own(allShapes, i)];
+    [...gates(), ...shapes.map(shapeTrace)].forEach(moveTrace);
   }
-  if (obstacles.length > 1) {
-    const { x, y, z, i: a, j: b, k: c } = obstacle();
-    Plotly.restyle("space", { x: [x], y: [y], z: [z], i: [a], j: [b], k: [c] }, [indexOf("obstacles")]);
-  }
+  if (obstacles.length > 1) moveTrace(obstacle());
   drawSeries();
   show();
+}
+
+// Draw a still trace, of lines, words or triangles, elsewhere.
+function moveTrace({ name, x, y, z, i, j, k }) {
+  Plotly.restyle("space", { x: [x], y: [y], z: [z], ...(i && { i: [i], j: [j], k: [k] }) }, [indexOf(name)]);
 }
 
 function options(id, values, label, value, change) {

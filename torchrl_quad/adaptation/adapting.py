@@ -41,13 +41,14 @@ class Adaptation:
     policy: Any  #: the one to fly from now on, better or a copy of the old one
     changed: bool  #: whether it is another one
     reason: str  #: in a sentence
-    fit: FlightFit | None  #: what the flights say; None where they could not be fitted
-    before: Mapping[str, float]  #: of the old policy in the fitted simulator, its ``return`` and the task's metrics
-    after: Mapping[str, float]  #: of ``policy``, from the same fresh starts
-    kl: float  #: how far ``policy`` is from the old one, KL(old || new), a mean over the old one's states
     seconds: Mapping[str, float]  #: of the processor, for ``fit``, ``steps`` and ``test``
-    flights: tuple[TensorDictBase, ...] = dataclasses.field(repr=False)  #: of both policies in this test
-    control_dt: float  #: [s], between their steps
+    control_dt: float  #: [s], between the steps of ``flights``
+    fit: FlightFit | None = None  #: what the flights say; None where they could not be fitted
+    #: of the old policy in the fitted simulator, its ``return`` and the task's metrics
+    before: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    after: Mapping[str, float] = dataclasses.field(default_factory=dict)  #: of ``policy``, from the same fresh starts
+    kl: float = 0.0  #: how far ``policy`` is from the old one, KL(old || new), a mean over the old one's states
+    flights: tuple[TensorDictBase, ...] = dataclasses.field(default=(), repr=False)  #: of both policies in this test
 
 
 @checked
@@ -162,14 +163,14 @@ class Adapter:
         try:
             fit = fit_flight(logs, self.task.params, cast(MotorCommand, self.motors))
         except LogError as error:
-            return self._kept(str(error), None, clock)
+            return self._found(str(error), clock)
         clock.lap("fit")
         if "rotors" in fit.not_told:
             why = "the flight does not tell what each rotor gives, or its motor commands do not tell how it moves"
-            return self._kept(why, fit, clock)
+            return self._found(why, clock, fit=fit)
         if not fit.gain >= LEAST_GAIN:  # NaN where nothing was held out
             better = f"only {fit.gain:.0%} better than" if fit.gain > 0.0 else "no better than"
-            return self._kept(f"the fit predicts what was held out {better} the simulator does", fit, clock)
+            return self._found(f"the fit predicts what was held out {better} the simulator does", clock, fit=fit)
         self.flown.fit, old = fit, self.policy
         with torch.random.fork_rng([]):
             torch.manual_seed(self.seed)
@@ -185,12 +186,12 @@ class Adapter:
         elif after["crash"] > min(before["crash"], MOST_CRASHES):
             why = f"in the fitted simulator the new policy crashes in {after['crash']:.0%} of the episodes"
         if why:
-            return self._kept(why, fit, clock, before, flights)
+            return self._found(why, clock, fit=fit, before=before, after=before, flights=flights)
         self.policy = new
         reason = f"the return in the fitted simulator rose from {before['return']:.4g} to {after['return']:.4g}"
         if abs(fit.thrust - 1.0) > 0.1:
             reason += f"; all rotors give {fit.thrust:.2f} of the thrust, by a load or a wrong motor_command"
-        return self._found(True, reason, fit, clock, before, after, kl, flights)
+        return self._found(reason, clock, True, fit=fit, before=before, after=after, kl=kl, flights=flights)
 
     def _improve(self, old: Any) -> Any:
         """The best of the policies on the way up the return."""
@@ -219,15 +220,9 @@ class Adapter:
         kind = ExplorationType.DETERMINISTIC  # as it flies on board
         return differentiable_rollout(self.env, actor, carry, self.horizon, exploration_type=kind)
 
-    def _kept(
-        self, why: str, fit: FlightFit | None, clock: _Clock, measured: Mapping[str, float] = {}, flights: Any = ()
-    ) -> Adaptation:
-        return self._found(False, f"nothing changed: {why}", fit, clock, measured, measured, 0.0, flights)
-
-    def _found(self, changed: bool, reason: str, fit: Any, clock: _Clock, *measured: Any) -> Adaptation:
-        before, after, kl, flights = measured
-        policy = copy.deepcopy(self.policy)
-        return Adaptation(policy, changed, reason, fit, before, after, kl, clock.laps, flights, self.task.control_dt)
+    def _found(self, why: str, clock: _Clock, changed: bool = False, **told: Any) -> Adaptation:
+        policy, reason = copy.deepcopy(self.policy), why if changed else f"nothing changed: {why}"
+        return Adaptation(policy, changed, reason, clock.laps, self.task.control_dt, **told)
 
     @torch.no_grad()
     def _fly(self, policy: Any, seed: int) -> TensorDictBase:

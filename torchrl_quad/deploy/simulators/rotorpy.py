@@ -11,7 +11,7 @@ from rotorpy.vehicles.multirotor import Multirotor
 
 from torchrl_quad.deploy import frames
 from torchrl_quad.deploy.contract import Contract, Fields
-from torchrl_quad.deploy.simulators import Simulator
+from torchrl_quad.deploy.simulators import SPECIAL, Simulator
 from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Control, Drone
 
 NAMES = {"position": "x", "quaternion": "q", "velocity": "v", "angular_velocity": "w"}
@@ -31,10 +31,7 @@ class RotorPy(Simulator):
     The loop "own" is its ``cmd_ctbr``, proportional, with the gain that gives the damping of the contract's loop.
     """
 
-    loops, lacks = (
-        (*LOOPS, "own"),
-        frozenset({"drag_height", "more than four rotors", "tilted rotors", "rotors that are not whole"}),
-    )
+    loops, lacks = (*LOOPS, "own"), SPECIAL
 
     def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
         self.version = f"RotorPy {version('rotorpy')}"

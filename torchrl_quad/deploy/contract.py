@@ -115,9 +115,8 @@ def digest(contract: Contract) -> str:
 
 def problem(contract: Contract) -> str | None:
     """Where a contract does not fit its schema, or its drones cannot fly, if anywhere."""
-    found = itertools.chain(_misfits(contract), _unequal(contract))
-    found = itertools.chain(found, _contradictions(contract["drone"], "drone", hovers=True))
-    return next(found, None) or drone_problem(contract)
+    drone = _contradictions(contract["drone"], "drone", hovers=True)
+    return next(itertools.chain(_misfits(contract), _unequal(contract), drone), None) or drone_problem(contract)
 
 
 def _unequal(contract: Contract) -> Iterator[str]:

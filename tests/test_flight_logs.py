@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from log_writers import END, OURS, TABLE, G, flight, matrix, own_table, write_csv
+from log_writers import END, OURS, TABLE, G, flight, own_table, write_csv
 from refusals import cases, refuses
 
 from torchrl_quad.errors import UserError, UserValueError
 from torchrl_quad.identification import LAYOUTS, Columns, LogError, MissingColumns, NoFlight, read_log
-from torchrl_quad.identification.errors import UnreadableLog, WrongFrame, WrongQuaternion, WrongUnit
+from torchrl_quad.identification.errors import UnreadableLog, WrongQuaternion
 
 FLIGHT = Path(__file__).parent.parent / "examples" / "data" / "figure8.csv.gz"
 GYRO = ("imu_gyro_x", "imu_gyro_y", "imu_gyro_z")
@@ -19,6 +19,7 @@ FORCE = ("imu_acc_x", "imu_acc_y", "imu_acc_z")
 PLACE = ("px", "py", "pz")
 SPEED = ("vx", "vy", "vz")
 TURN = ("qx", "qy", "qz", "qw")
+H = 0.5**0.5
 MOTORS = tuple(f"motor_motor_m{k}" for k in (1, 2, 3, 4))
 
 
@@ -104,11 +105,36 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
     "millimetres": (lambda t: scaled(t, PLACE + SPEED, 1e3), "WrongUnit", "px.*millimetres.*0.001.*vx.*0.001"),
     "mixed lengths": (lambda t: scaled(t, SPEED, 1e3), "WrongUnit", "vx, vy, vz.*1e\\+03 times"),
     "z down": (lambda t: scaled(t, ("pz", "vz"), -1), "WrongFrame", "z points down. If only z.*scale=.1.0, 1.0, -1"),
+    "body with z down": (
+        lambda t: {"qx": t["qw"], "qy": t["qz"], "qz": -t["qy"], "qw": -t["qx"]} | scaled(t, GYRO[1:] + FORCE[1:], -1),
+        "WrongFrame",
+        "does not thrust along its z axis.*y right and z down",
+    ),
+    "y up": (
+        lambda t: {
+            "py": t["pz"],
+            "pz": -t["py"],
+            "vy": t["vz"],
+            "vz": -t["vy"],
+            "qx": H * (t["qx"] - t["qw"]),
+            "qy": H * (t["qy"] + t["qz"]),
+            "qz": H * (t["qz"] - t["qy"]),
+            "qw": H * (t["qw"] + t["qx"]),
+        },
+        "WrongFrame",
+        "does not thrust along its z axis: the cosine between them is -?0.0",
+    ),
     "accelerometer down": (lambda t: scaled(t, FORCE[2:], -1), "WrongFrame", "other direction.*scale="),
     "accelerometer in m/s^2": (lambda t: scaled(t, FORCE, G), "WrongUnit", "mean length of 97.*in m/s.2, write"),
     "accelerometer in g": (lambda t: scaled(t, FORCE, 1 / G), "WrongUnit", "in g, write"),
     "accelerometer in mg": (lambda t: scaled(t, FORCE, 1e3 / G), "WrongUnit", "in thousandths of g, write"),
     "motors in percent": (lambda t: scaled(t, MOTORS, 100.0), "WrongUnit", "percents, write"),
+    "motors in DShot": (
+        lambda t: {n: 2000.0 * np.maximum(t[n], 30.0) for n in MOTORS},
+        "WrongUnit",
+        "DShot commands up to 2000, write",
+    ),
+    "motors in bytes": (lambda t: scaled(t, MOTORS, 255.0), "WrongUnit", "counts of 8 bits, write"),
     "motors in counts": (lambda t: scaled(t, MOTORS, 65535.0), "WrongUnit", "counts of 16 bits, write"),
     "motors beyond full": (lambda t: scaled(t, MOTORS, 2.0), "WrongUnit", "full command. It is like neither"),
     "motors are thrusts": (lambda t: scaled(t, MOTORS, 2.75), "WrongUnit", "full command. It is like neither"),
@@ -145,6 +171,7 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
     "knots": (lambda t: scaled(t, SPEED, 1 / 0.5144), "WrongUnit", "1.9.* times .*in knots, write .*0.5144"),
     "km/h": (lambda t: scaled(t, SPEED, 3.6), "WrongUnit", "3.* times .*in km/h, write .*0.277"),
     "millivolts": (lambda t: {"pwr_pm_vbat": 1e3 * t["pwr_pm_vbat"]}, "WrongUnit", "in the median.*millivolts, write"),
+    "centivolts": (lambda t: {"pwr_pm_vbat": 1e2 * t["pwr_pm_vbat"]}, "WrongUnit", "in centivolts, write"),
     "motors in pulses": (
         lambda t: {n: np.where(t["t"] < 0.5, 0.0, 1000.0 + t[n] / 65.535) * 65535.0 for n in MOTORS},
         "WrongUnit",
@@ -164,6 +191,7 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
     "clock in ms": (lambda t: scaled(t, ["t"], 1e3), "WrongUnit", "milliseconds, write"),
     "clock in ns": (lambda t: {"t": 1e9 * t["t"]}, "WrongUnit", "nanoseconds, write"),
     "clock jumps back": (lambda t: {"t": t["t"] - (t["t"] > 5.0)}, "ClockJumpsBack", "from 5 to 4.0.* at sample"),
+    "no order in time": (lambda t: {"t": t["t"][::-1]}, "ClockJumpsBack", "899 time.*. Sort its rows by time"),
     "no numbers": (lambda t: scaled(t, PLACE[:1], np.nan), "NotFiniteLog", "0 of 900 samples of position"),
     "motors off": (lambda t: scaled(t, MOTORS, 0.0), "NoFlight", "motor command is below"),
     "never in the air": (lambda t: {"pz": 0 * t["pz"], "vz": 0 * t["vz"]}, "NoFlight", "rises 0.000 m at most"),
@@ -172,7 +200,7 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
 
 
 HOPELESS = {"motors beyond full", "motors are thrusts", "motors hardly run", "motors turn to and fro", "no numbers"}
-HOPELESS |= {"clock jumps back", "motors off", "never in the air"}
+HOPELESS |= {"clock jumps back", "no order in time", "y up", "motors off", "never in the air"}
 HOPELESS |= {"world turned", "world mirrored", "attitude of another time"}
 
 
@@ -205,6 +233,7 @@ def test_each_fault_has_its_name_and_its_remedy(fault, table, plain, read):
 
 @cases(
     (lambda head, rows: [head, *(",".join(f'"{x}"' for x in row.split(",")) for row in rows)], None),
+    (lambda head, rows: [head, *(",".join(f'"{x}"'.replace(".", ",") for x in row.split(",")) for row in rows)], None),
     (lambda head, rows: [head, *rows[:-1], rows[-1][:40]], "is cut off: left out"),
     (lambda head, rows: ["sep=;", *(x.replace(",", ";") for x in (head, *rows))], None),
     (lambda head, rows: [x.replace(",", "|") for x in (head, *rows)], None),
@@ -369,35 +398,6 @@ def test_touching_down_and_landing_on_a_table_are_cut_out(tmp_path):
     expected = ((1.1, 4 + 0.9 / 0.97), (5.5 + 0.07 / 0.97, 8.75))  # 0.1 m above the ground, and above the table
     np.testing.assert_allclose(np.array(log.segments) * log.dt, expected, atol=0.02)
     assert "between take-off and landing are within 0.1 m of the ground" in str(log)
-
-
-def test_euler_angles_and_velocities_of_the_body_become_ours(tmp_path):
-    t = np.arange(0.0, END, 0.01)
-    true = flight(t)
-    r = matrix(true["quaternion"])
-    columns = own_table(t, velocity=np.einsum("nji,nj->ni", r, true["velocity"]))
-    columns["roll"], columns["pitch"] = np.arctan2(r[:, 2, 1], r[:, 2, 2]), -np.arcsin(r[:, 2, 0])
-    columns["yaw"] = np.degrees(np.arctan2(r[:, 1, 0], r[:, 0, 0]))
-    path = write_csv(tmp_path / "own.csv", columns)
-    euler = Columns(("roll", "pitch", "yaw"), scale=(1.0, 1.0, np.pi / 180))
-    turned = {k: v for k, v in TABLE.items() if k not in ("velocity", "quaternion")}
-    log = read_log(path, {**turned, "velocity_body": OURS["velocity"], "euler": euler})
-    np.testing.assert_allclose(log.velocity, true["velocity"], atol=1e-6)
-    np.testing.assert_allclose(np.abs((log.quaternion * true["quaternion"]).sum(-1)), 1.0, atol=1e-7)
-    refuses('"velocity_body"', read_log, path, TABLE, error=WrongFrame)
-    rates = np.einsum("nij,nj->ni", r, true["angular_velocity"])
-    with pytest.raises(WrongFrame, match="in the world frame"):
-        read_log(write_csv(path, own_table(t, angular_velocity=rates)), TABLE)
-    write_csv(path, own_table(t, motor_command=1000.0 + 1000.0 * true["motor_command"]))
-    refuses("pulses.*scale=0.001, offset=1000", read_log, path, TABLE, error=WrongUnit)
-    few = {k: v for k, v in TABLE.items() if k in ("time", "position", "quaternion")}
-    log = read_log(path, few | {"motor_command": Columns(OURS["motor_command"], scale=1 / 2000)})
-    inside = slice(*log.segments[0])
-    np.testing.assert_allclose(log.velocity[inside], true["velocity"][inside], atol=0.02)
-    assert log.acceleration is None and log.setpoint is None
-    twisted = {k: v for k, v in TABLE.items() if k != "quaternion"} | {"euler": OURS["angular_velocity"]}
-    write_csv(path, own_table(t))
-    refuses("does not follow euler .*belong together.$", read_log, path, twisted, error=WrongFrame)  # no order mends it
 
 
 HUGE = 10**400  # more than a float holds

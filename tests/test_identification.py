@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 import torch
-from log_writers import OURS, TABLE, G, write_csv
+from log_writers import END, OURS, TABLE, G, flight, matrix, own_table, write_csv
 from refusals import refuses
 from scipy.spatial.transform import Rotation
 from small_runs import ROOT
@@ -18,7 +18,8 @@ from torchrl_quad import HoveringEnv, load_drone
 from torchrl_quad.deploy import frames
 from torchrl_quad.dynamics import MotorCommand
 from torchrl_quad.errors import UserError
-from torchrl_quad.identification import NoFlight, TooShort, estimation, fitting, identify, prediction, read_log
+from torchrl_quad.identification import Columns, NoFlight, TooShort, estimation, fitting, identify, prediction, read_log
+from torchrl_quad.identification.errors import WrongFrame, WrongQuaternion, WrongUnit
 from torchrl_quad.identification.parameters import UNKNOWNS, Model
 from torchrl_quad.identification.prediction import prediction_error
 
@@ -338,3 +339,45 @@ def test_drag_wind_flips_and_noise_are_no_reason_to_refuse_a_flight(tmp_path):
     }.items():
         columns = mapping if name != "noise" else {k: x for k, x in mapping.items() if k != "velocity"}
         assert len(read_log(write_csv(tmp_path / f"{name}.csv", table), columns).time) > 2900, name
+
+
+def test_euler_angles_and_velocities_of_the_body_become_ours(tmp_path):
+    t = np.arange(0.0, END, 0.01)
+    true = flight(t)
+    r = matrix(true["quaternion"])
+    columns = own_table(t, velocity=np.einsum("nji,nj->ni", r, true["velocity"]))
+    columns["roll"], columns["pitch"] = np.arctan2(r[:, 2, 1], r[:, 2, 2]), -np.arcsin(r[:, 2, 0])
+    columns["yaw"] = np.degrees(np.arctan2(r[:, 1, 0], r[:, 0, 0]))
+    path = write_csv(tmp_path / "own.csv", columns)
+    euler = Columns(("roll", "pitch", "yaw"), scale=(1.0, 1.0, np.pi / 180))
+    turned = {k: v for k, v in TABLE.items() if k not in ("velocity", "quaternion")}
+    log = read_log(path, {**turned, "velocity_body": OURS["velocity"], "euler": euler})
+    np.testing.assert_allclose(log.velocity, true["velocity"], atol=1e-6)
+    np.testing.assert_allclose(np.abs((log.quaternion * true["quaternion"]).sum(-1)), 1.0, atol=1e-7)
+    refuses('"velocity_body"', read_log, path, TABLE, error=WrongFrame)
+    rates = np.einsum("nij,nj->ni", r, true["angular_velocity"])
+    with pytest.raises(WrongFrame, match="in the world frame"):
+        read_log(write_csv(path, own_table(t, angular_velocity=rates)), TABLE)
+    # Angles and quaternions of NED and FRD follow from the convention, and what is odd of them is told in its frame.
+    ned = {k: true[k] for k in ("position", "velocity", "angular_velocity")}
+    theirs = frames.px4().to(ned | {"quaternion": true["quaternion"]})
+    angles = Rotation.from_quat(theirs["quaternion"], scalar_first=True).as_euler("xyz")
+    given = dict(zip(("roll", "pitch", "yaw"), angles.T, strict=True))
+    last = np.roll(theirs["quaternion"], -1, 1)
+    write_csv(path, own_table(t, **{k: theirs[k] for k in ned}, quaternion=last) | given)
+    read = {k: v for k, v in TABLE.items() if k not in ("acceleration", "quaternion")}
+    px4 = dataclasses.replace(frames.px4(), motors=(0, 1, 2, 3))
+    turned = read_log(path, read | {"euler": ("roll", "pitch", "yaw")}, convention=px4)
+    np.testing.assert_allclose(np.abs((turned.quaternion * true["quaternion"]).sum(-1)), 1.0, atol=1e-7)
+    read["quaternion"] = OURS["quaternion"]
+    refuses("if the quaternion is scalar last", read_log, path, read, convention=px4, error=WrongQuaternion)
+    write_csv(path, own_table(t, motor_command=1000.0 + 1000.0 * true["motor_command"]))
+    refuses("pulses.*scale=0.001, offset=1000", read_log, path, TABLE, error=WrongUnit)
+    few = {k: v for k, v in TABLE.items() if k in ("time", "position", "quaternion")}
+    log = read_log(path, few | {"motor_command": Columns(OURS["motor_command"], scale=1 / 2000)})
+    inside = slice(*log.segments[0])
+    np.testing.assert_allclose(log.velocity[inside], true["velocity"][inside], atol=0.02)
+    assert log.acceleration is None and log.setpoint is None
+    twisted = {k: v for k, v in TABLE.items() if k != "quaternion"} | {"euler": OURS["angular_velocity"]}
+    write_csv(path, own_table(t))
+    refuses("does not follow euler .*belong together.$", read_log, path, twisted, error=WrongFrame)  # no order mends it

@@ -46,10 +46,8 @@ def test_a_ulog_is_read_in_our_frames_with_what_leaves_for_the_motors(tmp_path):
     assert "position comes at 50 Hz only" in str(log) and "THR_MDL_FAC = 0.3" in str(log)
     held = flight(np.floor(log.time * 10 + 1e-6) / 10)["position"]
     np.testing.assert_allclose(log.setpoint["position"], held, atol=1e-5)
-
-    with pytest.raises(MissingColumns, match="no column batery_status.voltage_v, named for battery_voltage"):
-        read_log(tmp_path / "flight.ulg", {"battery_voltage": "batery_status.voltage_v"})
-
+    none = tmp_path / "flight.ulg", {"battery_voltage": "batery.voltage"}
+    refuses("no column batery.voltage, named for", read_log, *none, error=MissingColumns)
     # Older firmware logs pulses; a logger that loses half a second leaves a gap.
     t, _ = messages.pop("actuator_motors")
     signal = flight(t - 5.0)["motor_command"][:, [3, 1, 0, 2]]
@@ -60,9 +58,11 @@ def test_a_ulog_is_read_in_our_frames_with_what_leaves_for_the_motors(tmp_path):
     log = read_log(write_ulog(tmp_path / "old.ulg", messages, {}))
     same(log, pieces=2)
     assert "actuator_outputs, pulses from 1000 to 2000 us" in str(log) and "1 gap(s) of up to 0.5" in str(log)
+    messages["actuator_outputs"] = (t, {"output": ("float", np.maximum(1999.0 * signal, 9.0))})
+    assert "actuator_outputs, DShot from 0 to 1999" in str(read_log(write_ulog(tmp_path / "old.ulg", messages, {})))
     del messages["actuator_outputs"]
-    with pytest.raises(MissingColumns, match="has no motor_command or rotor_speed: looked for actuator_motors"):
-        read_log(write_ulog(tmp_path / "none.ulg", messages, {}))
+    none = write_ulog(tmp_path / "none.ulg", messages, {})
+    refuses("no motor_command or rotor_speed: looked for actuator_motors", read_log, none, error=MissingColumns)
 
 
 def test_a_dataflash_log_of_ardupilot_is_read_in_our_frames(tmp_path):
@@ -71,9 +71,9 @@ def test_a_dataflash_log_of_ardupilot_is_read_in_our_frames(tmp_path):
     data = path.read_bytes()
     path.write_bytes(data[:200_000] + b"\xa3\x95\xff" * 5 + data[200_000:-7])
     assert "the dataflash log is damaged: " in str(read_log(path))
-    for parameters in ({"FRAME_CLASS": 2.0}, SERVOS | {"SERVO9_FUNCTION": 37.0}):
-        six = write_dataflash(path, dataflash_messages(), parameters)
-        refuses("drone with (six|5) rotors", read_log, six, error=WrongMotors)
+    for parameters in ({"FRAME_CLASS": 2}, SERVOS | {"SERVO9_FUNCTION": 37}, {"SERVO1_FUNCTION": 4}, {"Q_ENABLE": 1}):
+        six = write_dataflash(path, dataflash_messages(), {k: float(x) for k, x in parameters.items()})
+        refuses("drone with (six|5) rotors|is not the log of a quadrotor", read_log, six, error=WrongMotors)
 
 
 PLACES = {f"CA_ROTOR{k}_P{x}": v for k, xy in enumerate(((1, -1), (1, 1), (-1, 1), (-1, -1)))

@@ -210,7 +210,7 @@ class Writes(Disturbance):
     (
         Writes(("drone", "rotor_effectiveness"), torch.ones(2, 1), torch.ones(2, 1)),
         {},
-        r"'rotor_effectiveness'\) must have shape \(2, 4\), got \(2, 1\)",
+        r"'rotor_effectiveness'\), from Writes.start, must have shape \(2, 4\), got \(2, 1\)",
     ),
 )
 def test_what_a_disturbance_changes_in_vain_is_refused(disturbance, options, message):

@@ -144,8 +144,13 @@ def _add_signals(streams: dict[str, Stream], parameters: Mapping[str, float]) ->
             usual = parameters.get("PWM_MIN", 1000.0), parameters.get("PWM_MAX", 2000.0)
             low, high = (x if x > 0.0 else y for x, y in zip(own, usual, strict=True))
             if pulses is not None and high > low:
+                unit, most = "pulses", float(np.nanmax(pulses))
+                if most <= 1.01:
+                    unit, low, high = "shares", 0.0, 1.0
+                elif most < 2048.0 and np.nanmin(pulses[pulses > 0.0]) < 700.0:
+                    unit, low, high = "DShot", 0.0, 1999.0
                 signals[f"actuator_outputs.signal[{k}]"] = np.where(pulses < low, 0.0, (pulses - low) / (high - low))
-                said = f"{stem}, pulses from {low:g} to {high:g} us"
+                said = f"{stem}, {unit} from {low:g} to {high:g}{' us' if unit == 'pulses' else ''}"
     if signals:
         streams[stem] = Stream(stem, streams[stem].time, {**streams[stem].columns, **signals})
     return f"motor commands are in {said}{', placed by CA_ROTOR' if placed else ''}"
@@ -399,6 +404,12 @@ def _with_signals(outputs: Stream, parameters: Mapping[str, float], name: str, n
         found = re.fullmatch(r"SERVO(\d+)_FUNCTION", key)
         if found and value in _MOTORS:
             functions[_MOTORS.index(int(value))] = int(found[1])
+    assigned = [x for x in parameters if re.fullmatch(r"SERVO(\d+)_FUNCTION", x) and parameters[x] > 0.0]
+    if parameters.get("Q_ENABLE", 0.0) or (assigned and not {0, 1, 2, 3} <= functions.keys()):
+        raise WrongMotors(
+            f"{name} is not the log of a quadrotor: its SERVO functions do not have motors 1 to 4, or Q_ENABLE says "
+            "that it has wings. Only quadrotors are fitted."
+        )
     frame = int(parameters.get("FRAME_CLASS", 1))
     if frame in _FRAMES or len(functions) > 4:
         many = _FRAMES.get(frame, str(len(functions)))

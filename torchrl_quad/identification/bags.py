@@ -15,6 +15,7 @@ from torchrl_quad.errors import UserError, needing, one_line
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog, WrongMotors
 from torchrl_quad.identification.layouts import (
     BY_IMU,
+    NEEDED,
     RIVALS,
     ROS,
     Asked,
@@ -63,6 +64,9 @@ def read_bag(path: Path, columns: Asked) -> tuple[list[Stream], Layout, list[str
 def _read(bag: Any, name: str, columns: Asked) -> tuple[list[Stream], Layout, list[str]]:
     topics = {connection.topic: connection.msgtype for connection in bag.connections if connection.msgcount}
     layout = _layout(bag, topics, columns, name)
+    for quantities in NEEDED:
+        if not layout.columns.keys() & set(quantities):
+            raise MissingColumns(f"{name} has no {' or '.join(quantities)}. {_there(topics)}")
     asked: dict[str, list[str]] = {}
     for column in sorted(layout.names):
         asked.setdefault(column.split(".")[0], []).append(column)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torchrl_quad.deploy.frames import px4
+from torchrl_quad.deploy.frames import Convention, px4
 from torchrl_quad.identification.errors import Remedy, WrongFrame, WrongMotors, WrongQuaternion, WrongUnit, in_units
 from torchrl_quad.identification.layouts import G
 from torchrl_quad.identification.pieces import OFF
@@ -31,10 +32,19 @@ _QUATERNIONS: dict[str, Remedy] = {  # what a quaternion may be, and what mends 
     "scalar first, from world to body": {"order": _FIRST, "factor": _CONJUGATE},
 }
 _NED: Remedy = {"convention": px4(), "when": "all of the log is in NED and FRD"}
+_DOWN: Remedy = {  # the quaternion times (0, 1, 0, 0)
+    "quantity": "quaternion",
+    "order": (1, 0, 3, 2),
+    "factor": (-1.0, 1.0, 1.0, -1.0),
+    "when": "the body of the attitude has y right and z down",
+}
 LEAST_HOVER = 0.05  # of the full command: a drone of which this is more than hovering lifts itself a hundred times
 _COMMANDS = (  # factor, offset, least, largest, and what they are
     (0.01, 0.0, 0.0, 101.0, "percents"),
     (1e-3, 1000.0, 700.0, 2600.0, "pulses from 1000 to 2000 us"),
+    (1.0 / 255.0, 0.0, 0.0, 255.5, "counts of 8 bits"),
+    (5e-4, 0.0, 0.0, 2000.5, "DShot commands up to 2000"),
+    (1.0 / 1999.0, 48.0, 48.0, 2047.5, "DShot values from 48 to 2047"),
     (1.0 / 65535.0, 0.0, 0.0, 65535.5, "counts of 16 bits"),
 )
 _X = np.array([[1, 1, -1, -1], [-1, 1, 1, -1], [1, -1, 1, -1]])  # roll, pitch, yaw by our motors, yaw either way
@@ -48,9 +58,9 @@ def check_motors(signal: Signal) -> list[str]:
     low, high = float(signal.values.min()), float(signal.values.max())
     full = float(np.percentile(signal.values.mean(-1), 95))
     below = signal.values < -0.01
-    if -1.01 < low < -0.01 and high <= 1.01 and np.ptp(signal.values[below]) < 1e-3 and full > LEAST_HOVER:
+    if -1.01 < low < -0.01 and high <= 1.03 and np.ptp(signal.values[below]) < 1e-3 and full > LEAST_HOVER:
         return [f"{signal} is {low:.3g} in {below.mean():.0%} of its samples, as where motors are disarmed: taken as 0"]
-    if low >= -0.01 and high <= 1.01:
+    if low >= -0.01 and high <= 1.03:
         if OFF < full < LEAST_HOVER:
             raise WrongUnit(
                 f"{signal} reaches {high:.3g} at most, and must run from 0 to 1, the full command: no drone flies with "
@@ -65,7 +75,7 @@ def check_motors(signal: Signal) -> list[str]:
     ]
     if _turn_one_way(signal.values) and np.abs(signal.values).max() > 50.0:
         remedies.append({"quantity": signal.field, "name": "rotor_speed", "when": "they are rotor speeds in rad/s"})
-    none = "" if remedies else " It is like neither percents, pulses, counts of 16 bits nor speeds of rotors."
+    none = "" if remedies else " It is like neither percents, pulses, DShot, counts nor speeds of rotors."
     raise WrongUnit(
         f"{signal} runs from {low:.4g} to {high:.4g}, and must run from 0 to 1, the full command.{none}", *remedies
     )
@@ -115,7 +125,8 @@ def check_voltage(signal: Signal) -> None:
     if usual > 100.0:
         said = f"{signal} is {usual:.4g} in the median, and is in V."
         drop: Remedy = {"quantity": signal.field, "drop": True, "when": "it is no voltage"}
-        raise WrongUnit(said, *in_units(signal.field, "it is in", millivolts=1e-3, centivolts=1e-2), drop)
+        units = {k: x for k, x in (("millivolts", 1e-3), ("centivolts", 1e-2)) if 2.0 < usual * x < 60.0}
+        raise WrongUnit(said, *in_units(signal.field, "it is in", **units), drop)
 
 
 def check_velocity(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float, moving: Mask) -> None:
@@ -191,11 +202,16 @@ def check_specific_force(at: Mapping[str, Array], signals: Mapping[str, Signal],
     raise WrongFrame(f"{said} along the other direction (correlation {fit:.2f}).", _NED, *remedies, drop)
 
 
-def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float, moving: Mask) -> str:
+def check_rates(
+    at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float, moving: Mask, convention: Convention
+) -> str:
     """Compare the gyro with the derivative of the attitude under every convention, and note how late it is."""
-    q, given = at["quaternion"], signals["quaternion"]
+    q, given, theirs = at["quaternion"], signals["quaternion"], replace(convention, xyzw=False)
+    logged = theirs.to({"quaternion": q})["quaternion"]
     hypotheses = {
-        name: q[:, remedy.get("order", (0, 1, 2, 3))] * remedy.get("factor", 1.0)
+        name: theirs.back({"quaternion": logged[:, remedy.get("order", (0, 1, 2, 3))] * remedy.get("factor", 1.0)})[
+            "quaternion"
+        ]
         for name, remedy in _QUATERNIONS.items()
     }
     if "angular_velocity" not in signals:
@@ -243,7 +259,8 @@ def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: floa
         near = given.field == "euler" and 1.0 / 3.0 < factor * 180.0 / np.pi < 3.0
         degrees = in_units("euler", "the angles are in", degrees=np.pi / 180.0) if near else []
         raise WrongUnit(f"{said} an unknown unit.", *degrees, derive)
-    return f"{signal} fits the attitude: correlation {fit:.2f}, {1000.0 * lag:+.0f} ms late"
+    size = f", {factor:.2f} times as large" if not 0.8 < factor < 1.25 else ""
+    return f"{signal} fits the attitude: correlation {fit:.2f}, {1000.0 * lag:+.0f} ms late{size}"
 
 
 def _check_by_thrust(
@@ -269,6 +286,15 @@ def check_lean(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float
     of what accelerates it follows its velocity, as drag does, or is the wind's, which may hide all."""
     speed, force = smooth(at["velocity"], dt), smooth(slope(at["velocity"], dt), dt)
     up = smooth(rotate(at["quaternion"], np.broadcast_to([0.0, 0.0, 1.0], force.shape)), dt)
+    thrust = force + (0.0, 0.0, G)
+    along = float(np.median((up * thrust).sum(-1) / np.linalg.norm(thrust, axis=-1).clip(1e-9)))
+    if along < 0.7:
+        raise WrongFrame(
+            f"By {signals['quaternion']} and {signals['position']} the drone does not thrust along its z axis: the "
+            f"cosine between them is {along:.2f} in the median. z must point up in the world and in the body. Bring "
+            "all of the log into such frames.",
+            *([_NED, _DOWN] if along < -0.7 else []),
+        )
     lean, rows = G * up[:, :2] / up[:, 2:].clip(0.5), np.flatnonzero(moving & (up[:, 2] > 0.5))
     if len(rows) * dt < 3.0:
         return

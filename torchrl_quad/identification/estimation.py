@@ -125,7 +125,7 @@ def identify(
     found = parameters["command_delay"]["value"] if "command_delay" in parameters else motors.delay
     motors = dataclasses.replace(motors, delay=float(np.clip(found, -0.1, 0.5)))  # what a drone's file may say
     fitted = QuadrotorParams(**model.params(state.x)._asdict(), motor_command=motors)
-    left = _checked_trim(logs, fitted, past, "thrust" in state.free)
+    left = _checked_trim(logs, fitted, past, "thrust" in wanted)
     errors, by_flight = _errors(logs, {"fitted": fitted, "prior": prior}, past, horizon)
     half = quantile * cover.diag()[n:].clamp_min(0.0).sqrt() * UNKNOWNS["stream"].scale
     ends = zip(state.streams.tolist(), (state.streams - half).tolist(), (state.streams + half).tolist(), strict=True)

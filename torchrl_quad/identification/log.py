@@ -15,7 +15,15 @@ from pydantic import Field
 from torchrl_quad.deploy.frames import Convention
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
 from torchrl_quad.identification import checks
-from torchrl_quad.identification.errors import GapsTooLarge, LogError, NoFlight, UnreadableLog, WrongUnit, in_units
+from torchrl_quad.identification.errors import (
+    GapsTooLarge,
+    LogError,
+    NoFlight,
+    UnreadableLog,
+    WrongMotors,
+    WrongUnit,
+    in_units,
+)
 from torchrl_quad.identification.layouts import QUANTITIES, Columns, Layout, gather
 from torchrl_quad.identification.pieces import broken, find_pieces, motors_on
 from torchrl_quad.identification.remedies import Mended, remedy_for
@@ -179,7 +187,7 @@ def _read(
     sound = on & valid & ~broken(at, on, step)[0]
     moving = sound if sound.sum() > 10 else on
     checks.check_velocity(at, signals, step, moving)
-    notes.append(checks.check_rates(at, signals, step, moving))
+    notes.append(checks.check_rates(at, signals, step, moving, layout.convention))
     checks.check_lean(at, signals, step, moving)
     checks.check_specific_force(at, signals, step, moving)
     segments, found = find_pieces(at, valid, step, path.name, clearance, max_gap, min_duration)
@@ -187,7 +195,7 @@ def _read(
     setpoint = {q.removeprefix("setpoint."): x for q, x in at.items() if q.startswith("setpoint.")}
     present = {q.partition(".")[0] for q in at}
     motion: Any = {q: at.get(q) for q in ("position", "quaternion", "velocity", "angular_velocity", "acceleration")}
-    if "battery_voltage" not in at:
+    if "battery_voltage" not in at and "rotor_speed" not in layout.columns:
         notes.append("no battery voltage: the thrust of a command cannot be told from the charge of the battery")
     return FlightLog(
         name=path.name.removesuffix(".gz").rsplit(".", 1)[0] if path.is_file() else path.name,
@@ -224,12 +232,19 @@ def _signals(layout: Layout, streams: Sequence[Stream], name: str, notes: list[s
         gathered.pop("battery_voltage", None)
         notes.append(
             f"motor commands are rotor speeds as shares of {FULL_SPEED:g} rad/s, whatever the battery: a drone's "
-            f"motor_command with speed_per_volt {FULL_SPEED:g}, nominal_voltage 1 and delay 0 keeps the speeds"
+            f"motor_command with speed_per_volt {FULL_SPEED:g}, nominal_voltage 1 and delay 0 keeps the speeds; they "
+            f"reach {np.nanmax(np.abs(speeds.values)):.4g}, taken as rad/s"
         )
     motors = gathered["motor_command"].columns
     last = re.sub(r"\d+(?=\D*$)", lambda found: str(int(found[0]) + 1), max(motors))  # m5 after m4
     if last == max(motors):  # e after d
         last = f"{last[:-1]}{chr(ord(last[-1]) + 1)}"
+    next_one = re.sub(r"\d+(?=\D*$)", lambda found: str(int(found[0]) + 1), last)
+    if last not in motors and any({last, next_one} <= stream.columns.keys() for stream in streams):
+        raise WrongMotors(
+            f"{last} and {next_one} look like a fifth and a sixth motor. Only drones with four rotors are fitted; if "
+            "they are no motors, leave their columns out."
+        )
     if last not in motors and any(last in stream.columns for stream in streams):
         notes.append(f"{last} looks like a fifth motor: only {', '.join(motors)} are read, of a drone with four rotors")
     for quantity, signal in gathered.items():
@@ -250,7 +265,9 @@ def _signals(layout: Layout, streams: Sequence[Stream], name: str, notes: list[s
     if "quaternion" not in signals:
         euler = signals.pop("euler")
         checks.check_angles(euler)
-        signals["quaternion"] = replace(euler, values=from_euler(euler.values))
+        theirs = replace(layout.convention, xyzw=False)
+        turned = theirs.back({"quaternion": from_euler(euler.values)})["quaternion"]
+        signals["quaternion"] = replace(euler, values=turned)
     if signals["motor_command"].field == "motor_command":
         notes += checks.check_motors(signals["motor_command"])
     return signals

@@ -76,7 +76,10 @@ class IdentificationResult:
             float(np.polyval(x.thrust_map.flatten().tolist(), speed) / x.mass.max()) for x in (self.drone, self.prior)
         )
         thrust = f"; per mass the rotors give {found / before:.2f} times the thrust of the given drone: weigh it"
-        return f"after {horizon:g} s the fit predicts {fit}{thrust if not 0.8 < found / before < 1.2 else ''}"
+        said = thrust if not 0.8 < found / before < 1.2 else ""
+        left = self.trim.get("force_per_weight", (0.0, 0.0, 0.0))[2]
+        said += f"; {left:+.0%} of the weight is left over along z: weigh it" if abs(left) > 0.1 else ""
+        return f"after {horizon:g} s the fit predicts {fit}{said}"
 
     def __str__(self) -> str:
         used, held = self.settings["windows"], self.settings["held_out"]

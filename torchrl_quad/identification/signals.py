@@ -79,11 +79,12 @@ def clean(signal: Signal) -> tuple[Signal, list[str]]:
     time, values = time[finite], values[finite]
     back = np.flatnonzero(np.diff(time) < 0.0)
     if len(back):
-        k = back[0]
+        k, far = back[0], -np.diff(time).min()  # [s]
         raise ClockJumpsBack(
             f"The clock of {signal} jumps back from {time[k]:.10g} to {time[k + 1]:.10g} s at sample {k + 1}, and "
-            f"{len(back)} time(s) in all: samples have no order in time. Cut the file there and read the parts, or "
-            "name the right time column."
+            f"{len(back)} time(s) in all: samples have no order in time. "
+            + ("Cut the file there and read the parts" if len(back) < 3 and far > 1.0 else "Sort its rows by time")
+            + ", or name the right time column."
         )
     new = np.concatenate(([True], np.diff(time) > 0.0))
     notes = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import collections
 import contextlib
+import csv
 import gzip
 import io
 import itertools
@@ -67,7 +68,8 @@ def read_streams(path: Path, columns: Asked) -> Read:
 
 def _read(file: io.BufferedReader[Any], name: str, columns: Asked, most: int) -> Read:
     start = file.peek(8192)
-    if re.match(rb'H Product:Blackbox|"?Product"?,"?Blackbox', start):
+    is_blackbox = re.match(rb'H Product:Blackbox|"?Product"?,"?Blackbox', start) is not None
+    if is_blackbox and not isinstance(columns, Mapping):
         raise blackbox(name)
     for beginning, why in _NO_LOG.items():
         if re.match(beginning, start, re.IGNORECASE):
@@ -89,7 +91,10 @@ def _read(file: io.BufferedReader[Any], name: str, columns: Asked, most: int) ->
             f"{name} is not a log of a known kind: it is not text, and does not begin like a ULog, dataflash log, ROS "
             "bag or uSD log (versions 1 and 2). Export it as CSV."
         ) from error
-    return _read_csv(_counted(iter(lambda: file.readline(MAX_LINE + 1), b""), name, most), name, columns)
+    lines = _counted(iter(lambda: file.readline(MAX_LINE + 1), b""), name, most)
+    if is_blackbox:  # whose table begins after its settings
+        lines = itertools.dropwhile(lambda line: not re.match(rb'"?(loopIteration|time)\b', line), lines)
+    return _read_csv(lines, name, columns)
 
 
 def _counted(parts: Iterator[bytes], name: str, most: int) -> Iterator[bytes]:
@@ -108,7 +113,7 @@ def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
     if not first:
         raise UnreadableLog(f"{name} is empty. Give a log that has samples.")
     mark = _mark(first)
-    header = [part.strip().strip('"') for part in first.split(mark)]
+    header = [part.strip().strip('"') for part in _split(first, mark)]
     if not isinstance(columns, Mapping) and all(_number(x, mark) == _number(x, mark) for x in header):
         raise UnreadableLog(f"{name}: its first row holds numbers. Put a row above it that names the columns.")
     if len(header) > MAX_COLUMNS:
@@ -202,7 +207,7 @@ def _mark(header: str) -> str | None:
 
 
 def _cells(row: str, mark: str | None, width: int, name: str, k: int) -> list[str]:
-    cells = row.replace('"', "").split(mark)
+    cells = _split(row, mark)
     if len(cells) != width:
         above = "Give a CSV file whose first row names the columns: delete the lines above that one."
         raise UnreadableLog(
@@ -212,8 +217,12 @@ def _cells(row: str, mark: str | None, width: int, name: str, k: int) -> list[st
     return cells
 
 
+def _split(row: str, mark: str | None) -> list[str]:
+    return next(csv.reader([row], delimiter=mark)) if mark and '"' in row else row.replace('"', "").split(mark)
+
+
 def _number(cell: str, mark: str | None) -> float:
     try:
-        return float(cell if mark == "," else cell.replace(",", "."))
+        return float(cell.replace(",", "."))
     except ValueError:
         return np.nan

@@ -74,18 +74,11 @@ def assert_commands_what_the_bundle_does(target, folder, bundle):
     name, stubs = next(x.name for x in folder.glob("policy_*.c*")), folder.with_suffix(".stubs")
     before, after = STUBS[target].split("@")
     observe = OBSERVE if "Write this function" in (folder / "pilot.h").read_text() else ""
-    code = (
-        "static float x[99], said[20]; static int count;",
-        before,
-        (folder / name).read_text(),
-        observe,
-        after,
-        MAIN,
-    )
-    for header in set(re.findall(r'#include ["<](.+[.]h)', code[2])) - {"math.h", "pilot.h"}:
+    data, own = "static float x[99], said[20]; static int count;", (folder / name).read_text()
+    for header in set(re.findall(r'#include ["<](.+[.]h)', own)) - {"math.h", "pilot.h"}:
         (stubs / header).parent.mkdir(parents=True, exist_ok=True)
         (stubs / header).touch()
-    (stubs / name).write_text("\n".join(code))
+    (stubs / name).write_text("\n".join((data, before, own, observe, after, MAIN)))
     command = [{"px4": "g++"}.get(target, "gcc"), *FLAGS.split(), f"-I{stubs}", f"-I{folder}"]
     subprocess.run(["gcc", "-c", *command[1:], folder / "policy.c", "-o", stubs / "policy.o"], check=True)
     subprocess.run([*command, stubs / name, stubs / "policy.o", "-lm", "-o", stubs / "fly"], check=True)

@@ -327,8 +327,7 @@ def test_a_bundle_that_acts_or_remembers_differently_from_its_policy_is_not_writ
     for owner, name, wrong, error, said in wrongs:
         with monkeypatch.context() as patch:
             patch.setattr(owner, name, wrong)
-            with pytest.raises(error, match=said):
-                export_policy(actor, env, tmp_path / "policy")
+            refuses(said, export_policy, actor, env, tmp_path / "policy", error=error)
         assert not list(tmp_path.iterdir())
     assert export_policy(actor, env, tmp_path / "policy").is_dir()
 

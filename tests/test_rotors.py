@@ -276,6 +276,7 @@ def test_a_drone_of_a_contract_flies_in_mujoco_as_in_the_package_also_with_a_dea
 def test_a_contract_of_any_rotors_fits_its_schema_and_one_whose_rotors_do_not_agree_is_refused():
     tilted = fields(drone("tilted hexarotor"))
     assert contract.drone_problem({"drone": tilted, "plant": {"rotor_effectiveness": [0.0] * 6}}) is None
+    assert contract.problem({"version": contract.VERSION}) == "it: 'task' is a required property"
     for plant, message in (
         ({"rotor_spin": [1, -1, 1, -1]}, "rotor_positions and the other fields of rotors must be equally long"),
         ({"rotor_direction": [[0, 0, 0]] * 6}, "rotor_direction has a rotor without a direction"),

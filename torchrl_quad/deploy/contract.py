@@ -115,8 +115,10 @@ def digest(contract: Contract) -> str:
 
 def problem(contract: Contract) -> str | None:
     """Where a contract does not fit its schema, or its drones cannot fly, if anywhere."""
+    if misfit := next(_misfits(contract), None):
+        return misfit
     drone = _contradictions(contract["drone"], "drone", hovers=True)
-    return next(itertools.chain(_misfits(contract), _unequal(contract), drone), None) or drone_problem(contract)
+    return next(itertools.chain(_unequal(contract), drone), None) or drone_problem(contract)
 
 
 def _unequal(contract: Contract) -> Iterator[str]:

@@ -12,6 +12,7 @@ from refusals import cases, refuses
 from torchrl_quad.errors import UserError, UserValueError
 from torchrl_quad.identification import LAYOUTS, Columns, LogError, MissingColumns, NoFlight, read_log
 from torchrl_quad.identification.errors import UnreadableLog, WrongQuaternion
+from torchrl_quad.rotations import rotate_inverse
 
 FLIGHT = Path(__file__).parent.parent / "examples" / "data" / "figure8.csv.gz"
 GYRO = ("imu_gyro_x", "imu_gyro_y", "imu_gyro_z")
@@ -93,6 +94,26 @@ def turned(table, x, y):
     }
 
 
+def y_up(t):
+    """Position, velocity and attitude in a world whose y axis points up."""
+    x, y, z, w = (H * t[n] for n in TURN)
+    return {
+        "py": t["pz"],
+        "pz": -t["py"],
+        "vy": t["vz"],
+        "vz": -t["vy"],
+        "qx": x - w,
+        "qy": y + z,
+        "qz": z - y,
+        "qw": w + x,
+    }
+
+
+def in_body(t):
+    q, v = (np.stack([t[n] for n in names], -1) for names in (("qw", *TURN[:3]), SPEED))
+    return dict(zip(SPEED, rotate_inverse(q, v).T, strict=True))
+
+
 FAULTS = {  # a fault: what changes, the error, and what its message must name
     "gyro in degrees": (lambda t: scaled(t, GYRO, 180 / np.pi), "WrongUnit", "imu_gyro_x.*degrees/s. Write .*0.0174"),
     "gyro in milliradians": (lambda t: scaled(t, GYRO, 1e3), "WrongUnit", "imu_gyro_x.*milliradians"),
@@ -110,20 +131,9 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
         "WrongFrame",
         "does not thrust along its z axis.*y right and z down",
     ),
-    "y up": (
-        lambda t: {
-            "py": t["pz"],
-            "pz": -t["py"],
-            "vy": t["vz"],
-            "vz": -t["vy"],
-            "qx": H * (t["qx"] - t["qw"]),
-            "qy": H * (t["qy"] + t["qz"]),
-            "qz": H * (t["qz"] - t["qy"]),
-            "qw": H * (t["qw"] + t["qx"]),
-        },
-        "WrongFrame",
-        "does not thrust along its z axis: the cosine between them is -?0.0",
-    ),
+    "y up": (y_up, "WrongFrame", "does not thrust along its z axis: the cosine between them is -?0.0"),
+    "velocity of the body": (in_body, "WrongFrame", "body frame .correlation 1.000. and not in the world"),
+    "velocity without z": (lambda t: {"vz": 0.0 * t["vz"]}, "WrongFrame", "vz. does not follow .* 0.00 along x, y, z"),
     "accelerometer down": (lambda t: scaled(t, FORCE[2:], -1), "WrongFrame", "other direction.*scale="),
     "accelerometer in m/s^2": (lambda t: scaled(t, FORCE, G), "WrongUnit", "mean length of 97.*in m/s.2, write"),
     "accelerometer in g": (lambda t: scaled(t, FORCE, 1 / G), "WrongUnit", "in g, write"),
@@ -134,7 +144,6 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
         "WrongUnit",
         "DShot commands up to 2000, write",
     ),
-    "motors in bytes": (lambda t: scaled(t, MOTORS, 255.0), "WrongUnit", "counts of 8 bits, write"),
     "motors in counts": (lambda t: scaled(t, MOTORS, 65535.0), "WrongUnit", "counts of 16 bits, write"),
     "motors beyond full": (lambda t: scaled(t, MOTORS, 2.0), "WrongUnit", "full command. It is like neither"),
     "motors are thrusts": (lambda t: scaled(t, MOTORS, 2.75), "WrongUnit", "full command. It is like neither"),
@@ -148,6 +157,11 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
         lambda t: {n: 65535 * 3e-2 * (-1) ** k * t[n] for k, n in enumerate(MOTORS)},
         "WrongUnit",
         "in rad/s, wr",
+    ),
+    "one motor stands": (
+        lambda t: scaled(t, MOTORS[2:3], 0.0),
+        "WrongMotors",
+        "not change for the motor back left. Name",
     ),
     "motors in another order": (
         lambda t: dict(zip(MOTORS, (t[MOTORS[k]] for k in (3, 1, 2, 0)), strict=True)),
@@ -200,7 +214,7 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
 
 
 HOPELESS = {"motors beyond full", "motors are thrusts", "motors hardly run", "motors turn to and fro", "no numbers"}
-HOPELESS |= {"clock jumps back", "no order in time", "y up", "motors off", "never in the air"}
+HOPELESS |= {"one motor stands", "clock jumps back", "no order in time", "y up", "motors off", "never in the air"}
 HOPELESS |= {"world turned", "world mirrored", "attitude of another time"}
 
 

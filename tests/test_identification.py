@@ -381,3 +381,9 @@ def test_euler_angles_and_velocities_of_the_body_become_ours(tmp_path):
     twisted = {k: v for k, v in TABLE.items() if k != "quaternion"} | {"euler": OURS["angular_velocity"]}
     write_csv(path, own_table(t))
     refuses("does not follow euler .*belong together.$", read_log, path, twisted, error=WrongFrame)  # no order mends it
+
+
+def test_a_gyro_on_another_clock_is_no_other_order_of_motors(tmp_path):
+    rows = np.genfromtxt(REAL, delimiter=",", names=True)
+    late = {x: np.roll(rows[x], 10 * x.startswith("imu_gyro")) for x in rows.dtype.names}
+    assert "fits how the drone turns if the gyro is " in str(read_log(write_csv(tmp_path / "late.csv", late)))

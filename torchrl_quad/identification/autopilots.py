@@ -145,9 +145,12 @@ def _add_signals(streams: dict[str, Stream], parameters: Mapping[str, float]) ->
             low, high = (x if x > 0.0 else y for x, y in zip(own, usual, strict=True))
             if pulses is not None and high > low:
                 unit, most = "pulses", float(np.nanmax(pulses))
+                if np.nanmin(pulses) < 0.0:
+                    why = f"{stem} runs from {np.nanmin(pulses):g} to {most:g}: no pulses from {low:g} to {high:g} us"
+                    raise WrongMotors(f"{why}. Write the commands, 0 to 1, into a CSV, and give that.")
                 if most <= 1.01:
                     unit, low, high = "shares", 0.0, 1.0
-                elif most < 2048.0 and np.nanmin(pulses[pulses > 0.0]) < 700.0:
+                elif 1000.0 < most < 2048.0 and np.nanmin(pulses[pulses > 0.0]) < 700.0:
                     unit, low, high = "DShot", 0.0, 1999.0
                 signals[f"actuator_outputs.signal[{k}]"] = np.where(pulses < low, 0.0, (pulses - low) / (high - low))
                 said = f"{stem}, {unit} from {low:g} to {high:g}{' us' if unit == 'pulses' else ''}"

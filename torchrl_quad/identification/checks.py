@@ -109,8 +109,8 @@ def check_angles(signal: Signal) -> None:
 def check_quaternion(signal: Signal) -> list[str]:
     """Refuse quaternions that are not of unit length; a note if only some are, as of a tracker that lost the drone."""
     norm = np.linalg.norm(signal.values, axis=-1)
-    off = np.abs(norm - 1.0) > 0.05
-    if off.mean() > 0.01:
+    off, lost = np.abs(norm - 1.0) > 0.05, norm == 0.0  # which trackers write for what they do not see
+    if (off & ~lost).mean() > 0.01 or lost.mean() > 0.5:
         raise WrongQuaternion(
             f"{off.mean():.0%} of {signal} are not of length 1; the median is {np.median(norm):.3g}. Name the four "
             "columns of one quaternion.",
@@ -137,39 +137,45 @@ def check_velocity(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: f
     if np.percentile(speed, 99) > 100.0:
         said = f"By {place} the drone flies at {np.percentile(speed, 99):.3g} m/s."
         raise WrongUnit(said, *in_units("position", "the position is in", millimetres=1e-3, centimetres=1e-2))
-    signal = signals.get("velocity")
+    signal = signals.get("velocity") or signals.get("velocity_body")
     if signal is None or speed.std() + speed.mean() < 0.05:
         return
     given = smooth(at["velocity"], dt)
     fit, factor, _ = _compare(given, derived, dt, moving)
     if not 0.6 < factor < 1.6:
-        size = "position" if factor < 1.0 else "velocity"
+        size = "position" if factor < 1.0 else signal.field
         ratio = min(factor, 1.0 / factor)
         lengths = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
-        lengths |= {"km/h": 1 / 3.6, "knots": 0.5144} if size == "velocity" else {}
+        lengths |= {"km/h": 1 / 3.6, "knots": 0.5144} if size == signal.field else {}
         lengths = dict(sorted(lengths.items(), key=lambda item: abs(np.log(ratio / item[1]))))
         raise WrongUnit(
             f"{signal} is {factor:.3g} times the derivative of {place}: they, or the clock, are in different units.",
-            *in_units(size, f"the {size} is in", **{k: x for k, x in lengths.items() if 0.8 < ratio / x < 1.25}),
-            {"quantity": "velocity", "drop": True},
+            *in_units(
+                size,
+                f"the {size.partition('_')[0]} is in",
+                **{k: x for k, x in lengths.items() if 0.8 < ratio / x < 1.25},
+            ),
+            {"quantity": signal.field, "drop": True},
         )
-    body, _, _ = _compare(smooth(rotate(at["quaternion"], at["velocity"]), dt), derived, dt, moving)
-    if body > fit + 0.02 and body > 0.9:
+    frames = ("world", "body") if signal.field == "velocity" else ("body", "world")
+    turn, name = (rotate, "velocity_body") if frames[0] == "world" else (rotate_inverse, "velocity")
+    other, _, _ = _compare(smooth(turn(at["quaternion"], at["velocity"]), dt), derived, dt, moving)
+    if other > 0.9 and (other > fit + 0.02 or 1.0 - other < 0.4 * (1.0 - fit)):
         raise WrongFrame(
-            f"{signal} fits the derivative of {place} in the body frame (correlation {body:.2f}) and not in the world "
-            f"frame ({fit:.2f}).",
-            {"quantity": "velocity", "name": "velocity_body"},
+            f"{signal} fits the derivative of {place} in the {frames[1]} frame (correlation {other:.3f}) and not in "
+            f"the {frames[0]} frame ({fit:.3f}).",
+            {"quantity": signal.field, "name": name},
         )
-    still = np.minimum(given[moving].std(0), derived[moving].std(0)) < 0.05
+    still = np.maximum(given[moving].std(0), derived[moving].std(0)) < 0.15
     sides = [1.0 if still[k] else _compare(given[:, [k]], derived[:, [k]], dt, moving)[0] for k in range(3)]
     if fit < 0.7 or min(sides) < 0.2:
         flip = tuple(-1.0 if side < 0.2 else 1.0 for side in sides)
         raise WrongFrame(
             f"{signal} does not follow {place}: correlations with the derivative are "
             f"{', '.join(f'{side:.2f}' for side in sides)} along x, y, z.",
-            {"quantity": "velocity", "factor": flip, "when": "an axis of the velocity points the other way"},
+            {"quantity": signal.field, "factor": flip, "when": "an axis of the velocity points the other way"},
             {"quantity": "position", "factor": flip, "when": "an axis of the position points the other way"},
-            {"quantity": "velocity", "drop": True, "when": "it shall be derived from the position"},
+            {"quantity": signal.field, "drop": True, "when": "it shall be derived from the position"},
         )
 
 
@@ -354,8 +360,15 @@ def check_order(
     signal, rows = signals["motor_command"], np.concatenate([np.arange(start, stop) for start, stop in pieces])
     parts = (rows, rows[: len(rows) // 2], rows[len(rows) // 2 :])  # what is chance in one half is not in the other
 
-    def worth_of(signs: Array) -> Array:
-        fits = turning_fits(at["angular_velocity"], at["motor_command"], dt, parts, signs)
+    command = at["motor_command"][rows]
+    spread, alike = command.std(0), np.ptp(command, 1).max() < 1e-6
+    if spread.max() > 0.01 and (alike or spread.min() < 1e-3 * spread.max()):
+        place = ("front left", "back left", "back right", "front right")[int(spread.argmin())]
+        which = "are the same for all motors" if alike else f"do not change for the motor {place}"
+        raise WrongMotors(f"In flight {signal} {which}. Name the commands of all four.")
+
+    def worth_of(signs: Array, late: int = 0) -> Array:
+        fits = turning_fits(np.roll(at["angular_velocity"], -late, 0), at["motor_command"], dt, parts, signs)
         return fits[..., 0] + fits[..., 1] + np.abs(fits[..., 2])  # yaw: which turn alike, not which way
 
     worth = worth_of(_X)
@@ -369,6 +382,12 @@ def check_order(
             f"{plus[0].max():.2f}, and in an X to {worth[0, best]:.2f}): only rotors in an X are read."
         )
     if (worth[:, best] > worth[:, 0] + 0.15).all() and worth[0, best] > worth[0, 0] + 0.2:
+        reach, step = round(MAX_LAG / dt), max(1, round(0.02 / dt))
+        shifts = range(-reach, reach + 1, step)
+        apart = np.array([worth_of(_X, k)[0] for k in shifts])  # a gyro on another clock
+        if apart.max(0).argmax() == 0:
+            late = 1000.0 * dt * shifts[int(apart[:, 0].argmax())]
+            return f"the order of the motors fits how the drone turns if the gyro is {late:.0f} ms late"
         raise WrongMotors(
             f"{signal} explain how the drone turns less in the order front left, back left, back right, front right "
             f"(correlations about roll, pitch and yaw add up to {worth[0, 0]:.2f}) than in another "

@@ -82,7 +82,7 @@ class Mended:
 
 
 def remedy_for(error: LogError, start: Mended, read: Callable[[Mended], object]) -> Mended | None:
-    """The first of the remedies with which the log reads, alone or with those of the errors that come next."""
+    """The fewest remedies with which the log reads: one alone, else with those of the errors that come next."""
     left = itertools.count(_MOST, -1)
 
     def found(error: LogError, before: Mended, depth: int) -> Mended | None:
@@ -102,7 +102,7 @@ def remedy_for(error: LogError, start: Mended, read: Callable[[Mended], object])
                 return mended
         return None
 
-    return found(error, start, _DEEPEST)
+    return next((x for depth in range(1, _DEEPEST + 1) if (x := found(error, start, depth))), None)
 
 
 def _places(convention: Convention, quantity: str, count: int) -> list[int]:

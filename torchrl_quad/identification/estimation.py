@@ -322,16 +322,19 @@ class Fit:
         return {"z_ratio": f"its best value is {limit} that a body can have; it needs {UNKNOWNS['z_ratio'].why}"}
 
 
-@dataclasses.dataclass
 class Checkpoint:
     """A file with the last step of each stage of a fit."""
 
-    path: str | Path | None
-    fingerprint: str
+    def __init__(self, path: str | Path | None, fingerprint: str) -> None:
+        self.path, self.fingerprint, self.stages = path, fingerprint, dict[str, Any]()
+        if path is not None and Path(path).is_file():
+            with self._named():
+                content = json.loads(Path(path).read_text())
+                self.stages = dict(content["stages"]) if content["fingerprint"] == fingerprint else {}
 
     def resume(self, stage: str, start: State) -> State:
         """The last step of a stage, or its start."""
-        found = self._read().get(stage)
+        found = self.stages.get(stage)
         with self._named():
             if found is None or tuple(found["free"]) != start.free:
                 return start
@@ -342,19 +345,10 @@ class Checkpoint:
 
     def write(self, stage: str, state: State) -> None:
         """Keep a step."""
-        if self.path is None:
-            return
-        entry = dataclasses.asdict(state) | {name: getattr(state, name).tolist() for name in _TENSORS}
-        content = {"fingerprint": self.fingerprint, "stages": {**self._read(), stage: entry}}
-        with replacing(self.path) as temporary:
-            temporary.write_text(json.dumps(content))
-
-    def _read(self) -> dict[str, Any]:
-        if self.path is None or not Path(self.path).is_file():
-            return {}
-        with self._named():
-            content = json.loads(Path(self.path).read_text())
-            return dict(content["stages"]) if content["fingerprint"] == self.fingerprint else {}
+        if self.path is not None:
+            self.stages[stage] = dataclasses.asdict(state) | {x: getattr(state, x).tolist() for x in _TENSORS}
+            with replacing(self.path) as temporary:
+                temporary.write_text(json.dumps({"fingerprint": self.fingerprint, "stages": self.stages}))
 
     @contextmanager
     def _named(self) -> Iterator[None]:

@@ -251,6 +251,13 @@ def test_each_fault_has_its_name_and_its_remedy(fault, table, plain, read):
     (lambda head, rows: [head, *rows[:-1], rows[-1][:40]], "is cut off: left out"),
     (lambda head, rows: ["sep=;", *(x.replace(",", ";") for x in (head, *rows))], None),
     (lambda head, rows: [x.replace(",", "|") for x in (head, *rows)], None),
+    (lambda head, rows: ["# " + head, *rows], None),
+    (lambda head, rows: ["# exported, today", "#", *(x.replace(",", ";") for x in ("# " + head, *rows))], None),
+    (lambda head, rows: [x.replace(",", "\t") for x in ("#" + head, *rows)], None),
+    (lambda head, rows: ["% " + head.replace(",", " "), *(x.replace(",", "  ") for x in rows)], None),  # numpy.savetxt
+    (lambda head, rows: [head.replace(",", ";"), *(x.replace(",", ";").replace(".", ",") for x in rows)], None),
+    (lambda head, rows: ["# a remark", head, *rows], None),
+    (lambda head, rows: ["%mode," + head, *(f"MANUAL,{x}" for x in rows)], None),  # as rostopic writes
     (lambda head, rows: [head, *(f"{row}," for row in rows)], None),
     (lambda head, rows: rows, "its first row holds numbers. Put a row above it"),
     (lambda head, rows: ["made by a program", head, *rows], "names the columns: delete the lines above"),

@@ -390,22 +390,6 @@ def test_limits_of_size_are_named_before_memory_is_full(tmp_path, monkeypatch):
     assert "has more than 2,000,000,000 bytes, the maximum" in refused(tmp_path / "large.csv")
 
 
-def test_tables_of_other_separators_and_headers_that_begin_as_comments_are_read(tmp_path):
-    path = write_csv(tmp_path / "a.csv", own_table(times(100)))
-    plain, (head, *rows) = read_log(path, TABLE), path.read_text().splitlines()
-    for text in (
-        "\n".join(["# " + head, *rows]),
-        "\n".join(["# exported, today", "#", "# " + head.replace(",", ";"), *(x.replace(",", ";") for x in rows)]),
-        "\n".join(["#" + head.replace(",", "\t"), *(x.replace(",", "\t") for x in rows)]),
-        "\n".join(["% " + head.replace(",", " "), *(x.replace(",", "  ") for x in rows)]),  # as numpy.savetxt writes
-        "\n".join([head.replace(",", ";"), *(x.replace(",", ";").replace(".", ",") for x in rows)]),
-        "\n".join(["# a remark", head, *rows]),
-        "\n".join(["%mode," + head, *(f"MANUAL,{x}" for x in rows)]),  # as rostopic writes
-    ):
-        path.write_text(text)
-        np.testing.assert_array_equal(read_log(path, TABLE).position, plain.position)
-
-
 def test_a_pipe_a_socket_and_a_device_are_refused_unopened(tmp_path, monkeypatch):
     os.mkfifo(tmp_path / "pipe.csv")
     (tmp_path / "link.csv").symlink_to("/dev/zero")

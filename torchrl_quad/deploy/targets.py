@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from string import Template
 
 from torchrl_quad.deploy import autopilots
 from torchrl_quad.deploy.bundle import load_bundle
@@ -13,16 +12,11 @@ from torchrl_quad.deploy.simulators.vehicle import Drone
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.files import replacing_folder
 
-#: By target the files of its folder, beside the network and ``pilot.h``, with their text where it is no template.
-TARGETS: dict[str, dict[str, str | None]] = {
-    "crazyflie": {
-        "policy_crazyflie.c": None,
-        "Kbuild": "obj-y += policy_crazyflie.o policy.o\n",
-        "app-config": "CONFIG_APP_ENABLE=y\nCONFIG_APP_PRIORITY=1\nCONFIG_APP_STACKSIZE=$stack\n",
-        "Makefile": "OOT_CONFIG := $$(PWD)/app-config\ninclude $$(CRAZYFLIE_BASE)/tools/make/oot.mk\n",
-    },
-    "px4": {"policy_px4.cpp": None},
-    "betaflight": {"policy_betaflight.c": None},
+#: By target the files of its folder, beside the network and ``pilot.h``, as their templates are called.
+TARGETS = {
+    "crazyflie": ("policy_crazyflie.c", "Kbuild", "app-config", "Makefile"),
+    "px4": ("policy_px4.cpp",),
+    "betaflight": ("policy_betaflight.c",),
 }
 # What each takes of what policies command.
 MODES = dict.fromkeys(("crazyflie", "px4"), ("rates", "attitude", "velocity")) | {"betaflight": ("rates",)}
@@ -76,10 +70,7 @@ def write_target(folder: str | Path, target: str) -> Path:
     features = ["aims" if aims else "yours", control, *["thrust"] * (control != "velocity")]
     features += ["memory"] * bool(contract["memory"])
     place = folder.parent / f"{folder.name}_{target}"
-    files = {"pilot.h": None, **TARGETS[target]}
-    written = {
-        name: Template(x).substitute(values) if x else fill_in(name, values, features) for name, x in files.items()
-    }
+    written = {name: fill_in(name, values, features) for name in ("pilot.h", *TARGETS[target])}
     written |= {name: (folder / name).read_text() for name in ("policy.c", "policy.h")}
 
     def check(place: Path) -> None:

@@ -51,7 +51,7 @@ def run(tmp_path, monkeypatch):
     ("profile_recipes", f"--algorithms bptt --iterations 2 --skip 1 --overrides {SMALL}", 1),
     pytest.param("identification", "--seeds 1 --seconds 10", 10, marks=pytest.mark.slow),  # it simulates a flight
     ("real_flights", "--flights flights --network-steps 2 --folder fits", 24),
-    ("identified_training", f"{ONE} --drones before=cf2x --judge crazyflie --tasks hovering --no-compile", 2),
+    ("identified_training", f"{ONE} --drones before=visfly --judge crazyflie --tasks hovering --no-compile", 2),
 )
 @pytest.mark.usefixtures("quick_fits")
 def test_a_benchmark_writes_a_table(name, arguments, rows, run, run_here, tmp_path, monkeypatch):

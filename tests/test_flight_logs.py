@@ -9,7 +9,7 @@ import pytest
 from log_writers import END, OURS, TABLE, G, flight, own_table, write_csv
 from refusals import cases, refuses
 
-from torchrl_quad.errors import UserError, UserValueError
+from torchrl_quad.errors import UserError
 from torchrl_quad.identification import LAYOUTS, Columns, LogError, MissingColumns, NoFlight, read_log
 from torchrl_quad.identification.errors import UnreadableLog, WrongQuaternion
 from torchrl_quad.rotations import rotate_inverse
@@ -440,22 +440,3 @@ def test_arguments_that_make_no_log_are_refused_by_name(name, tmp_path):
             read_log(**{"path": path, "columns": TABLE} | {name: value})
         assert name in str(refused.value) or name in ("columns", "path")
         assert "\n" not in str(refused.value)
-
-
-def test_columns_and_layouts_say_which_of_their_fields_is_wrong():
-    for field, values in {
-        "scale": (0, True, "2", None, np.inf, HUGE, (1, 2), 1j),
-        "offset": (np.nan, [], [[1.0] * 3]),
-    }.items():
-        for value in values:
-            with pytest.raises(UserValueError, match=f"Columns: {field} of a, b, c must be a number, or one for each"):
-                Columns(("a", "b", "c"), **{field: value})
-    refuses("names must be the names of columns, got 5", Columns, 5, error=UserValueError)
-    for changes, message in (
-        ({"columns": {"position": ("x", "y", "z")}}, "position takes 3 column.* got 1: x"),
-        ({"columns": {"position": (5,)}}, "columns: 'position' takes the name of a column"),
-        ({"columns": {"speed": (("v",),)}}, "Unknown quantity 'speed'"),
-        ({"convention": "px4"}, "convention must be one of torchrl_quad.deploy.frames, got 'px4'"),
-        ({"time": Columns(("s", "ns"))}, "time takes 1 column.* got 2: s, ns"),
-    ):
-        refuses(message, replace, LAYOUTS["nanobench"], error=UserError, **changes)

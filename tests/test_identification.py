@@ -17,8 +17,18 @@ from benchmarks import identification as benchmark
 from torchrl_quad import HoveringEnv, load_drone
 from torchrl_quad.deploy import frames
 from torchrl_quad.dynamics import MotorCommand
-from torchrl_quad.errors import UserError
-from torchrl_quad.identification import Columns, NoFlight, TooShort, estimation, fitting, identify, prediction, read_log
+from torchrl_quad.errors import UserError, UserValueError
+from torchrl_quad.identification import (
+    LAYOUTS,
+    Columns,
+    NoFlight,
+    TooShort,
+    estimation,
+    fitting,
+    identify,
+    prediction,
+    read_log,
+)
 from torchrl_quad.identification.errors import WrongFrame, WrongQuaternion, WrongUnit
 from torchrl_quad.identification.parameters import UNKNOWNS, Model
 from torchrl_quad.identification.prediction import prediction_error
@@ -387,3 +397,22 @@ def test_a_gyro_on_another_clock_is_no_other_order_of_motors(tmp_path):
     rows = np.genfromtxt(REAL, delimiter=",", names=True)
     late = {x: np.roll(rows[x], 10 * x.startswith("imu_gyro")) for x in rows.dtype.names}
     assert "fits how the drone turns if the gyro is " in str(read_log(write_csv(tmp_path / "late.csv", late)))
+
+
+def test_columns_and_layouts_say_which_of_their_fields_is_wrong():
+    for field, values in {
+        "scale": (0, True, "2", None, np.inf, 10**400, (1, 2), 1j),
+        "offset": (np.nan, [], [[1.0] * 3]),
+    }.items():
+        for value in values:
+            with pytest.raises(UserValueError, match=f"Columns: {field} of a, b, c must be a number, or one for each"):
+                Columns(("a", "b", "c"), **{field: value})
+    refuses("names must be the names of columns, got 5", Columns, 5, error=UserValueError)
+    for changes, message in (
+        ({"columns": {"position": ("x", "y", "z")}}, "position takes 3 column.* got 1: x"),
+        ({"columns": {"position": (5,)}}, "columns: 'position' takes the name of a column"),
+        ({"columns": {"speed": (("v",),)}}, "Unknown quantity 'speed'"),
+        ({"convention": "px4"}, "convention must be one of torchrl_quad.deploy.frames, got 'px4'"),
+        ({"time": Columns(("s", "ns"))}, "time takes 1 column.* got 2: s, ns"),
+    ):
+        refuses(message, dataclasses.replace, LAYOUTS["nanobench"], error=UserError, **changes)

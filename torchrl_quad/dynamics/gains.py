@@ -127,8 +127,9 @@ def check_flown(controller: FlightController, flown: QuadrotorParams, dt: float)
         raise UserValueError(
             f"drone: in steps of dt={dt:g} s the rate loop is unstable with an inertia of {listed(true[0])} kg m2, "
             f"motors of {listed(true[1])} s, and rotors that give {listed(stronger.round(2))} times the torque, since "
-            f"its gains are for {listed(believed[0])}, {listed(believed[1])} and 1. Choose them nearer to these, a "
-            "smaller dt, or a drone with a lower rate_gain."
+            f"its gains are for {listed(believed[0])}, {listed(believed[1])} and 1. "
+            + ("List its rotors in the order of the controller's. " if (stronger < 0.2).any() else "")
+            + "Choose them nearer to these, a smaller dt, or a drone with a lower rate_gain."
         )
 
 

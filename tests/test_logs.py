@@ -4,6 +4,7 @@ import csv
 import json
 import struct
 import sys
+import time
 from collections import Counter
 
 import pytest
@@ -84,20 +85,26 @@ def test_wandb_gets_configuration_metrics_pictures_films_replay_and_artifact(lau
 
 
 def wandb_records(path):
-    """What an offline run has kept: chunks in blocks of 32 KiB, each after 4 bytes of checksum, its size, its kind."""
+    """What an offline run has kept: chunks in blocks of 32 KiB, each after 4 bytes of checksum, its size, its kind. The
+    last record is "exit", for which wandb's own process may take a moment."""
     from wandb.proto import wandb_internal_pb2
 
-    content, at, data, records = path.read_bytes(), 7, b"", {}
-    while at < len(content):
-        if 32768 - at % 32768 < 7:  # too little for a chunk is left empty
-            at += 32768 - at % 32768
-        size, kind = struct.unpack_from("<HB", content, at + 4)
-        data += content[at + 7 : at + 7 + size]
-        at += 7 + size
-        if kind in (1, 4):  # whole, or the last part
-            record = wandb_internal_pb2.Record.FromString(data)
-            records.setdefault(record.WhichOneof("record_type"), []).append(record)
-            data = b""
+    for _ in range(200):
+        content, at, data, records = path.read_bytes(), 7, b"", {}
+        while at + 7 <= len(content):
+            if 32768 - at % 32768 < 7:  # too little for a chunk is left empty
+                at += 32768 - at % 32768
+                continue
+            size, kind = struct.unpack_from("<HB", content, at + 4)
+            data += content[at + 7 : at + 7 + size]
+            at += 7 + size
+            if kind in (1, 4) and at <= len(content):  # whole, or the last part
+                record = wandb_internal_pb2.Record.FromString(data)
+                records.setdefault(record.WhichOneof("record_type"), []).append(record)
+                data = b""
+        if "exit" in records:
+            break
+        time.sleep(0.1)
     return records
 
 

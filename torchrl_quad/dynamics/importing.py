@@ -176,7 +176,7 @@ def _examples(found: Found) -> dict[str, str]:
     most = ASKED["rotor_speed_max"] if curve is None else f"{speed_at(force, curve):.4g}"
     thrust = f"[{force / max(fast, 1.0) ** 2:.2g}, 0, 0]"
     examples = ASKED | {"rotor_spin": spin, "thrust_map": thrust, "rotor_speed_max": most}
-    if curve is not None:
+    if curve is not None and curve[1] < 0.0 < curve[0]:
         examples["rotor_speed_min"] = f"{-0.55 * curve[1] / curve[0]:.3g}"  # a tenth beyond the lowest thrust
     examples["linear_drag"] = str([float(f"{0.3 * heavy:.2g}")] * 3)
     return {name: example.replace(" ", "") for name, example in examples.items()}  # one word of a command line

@@ -149,7 +149,7 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
     own = {"frame": LSY_FRAMES[axis], "closed": False, "box": box, "start_range": 0.05, "floor": box[0][2], **own}
     notes = [
         f"gates are flown along their {axis} axis",
-        f"they are open {own['width']:g} x {own['height']:g} m, with frames of {own['frame']:g} m",
+        f"they are open {shown(own['width'])} x {shown(own['height'])} m, with frames of {shown(own['frame'])} m",
         "poles are 0.03 m thick, and end at their position",
         "the drone hovers above its start; drone, sensors and disturbances are not read",
     ]
@@ -174,7 +174,9 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
     own["gates"] = posed(centres, rotations)
     before = (centres - LSY_RUN_UP * rotate(rotations, [1.0, 0.0, 0.0])).tolist()
     own |= {"position_jitter": spread.tolist()} if spread is not None else {}
-    own |= {"rotation_jitter": drawn["gate_rpy"][1].tolist()} if "gate_rpy" in drawn else {}
+    if "gate_rpy" in drawn:  # about the file's axes
+        roll, pitch, yaw = drawn["gate_rpy"][1].tolist()
+        own["rotation_jitter"] = [roll, pitch, yaw] if axis == "x" else [pitch, roll, yaw]
     own["starts"] = [[*start[:2], max(start[2], box[0][2] + 0.25)], *before[1:]]
     tops = as_array([pole["pos"] for pole in track.get("obstacles", [])]).reshape(-1, 3)
     middle, spread = drawn.get("obstacle_pos", (np.zeros(3), np.zeros(3)))

@@ -240,7 +240,7 @@ def _signals(layout: Layout, streams: Sequence[Stream], name: str, notes: list[s
     if last == max(motors):  # e after d
         last = f"{last[:-1]}{chr(ord(last[-1]) + 1)}"
     next_one = re.sub(r"\d+(?=\D*$)", lambda found: str(int(found[0]) + 1), last)
-    if last not in motors and any({last, next_one} <= stream.columns.keys() for stream in streams):
+    if last not in motors and next_one != last and any({last, next_one} <= stream.columns.keys() for stream in streams):
         raise WrongMotors(
             f"{last} and {next_one} look like a fifth and a sixth motor. Only drones with four rotors are fitted; if "
             "they are no motors, leave their columns out."

@@ -69,7 +69,7 @@ def read_streams(path: Path, columns: Asked) -> Read:
 def _read(file: io.BufferedReader[Any], name: str, columns: Asked, most: int) -> Read:
     start = file.peek(8192)
     is_blackbox = re.match(rb'H Product:Blackbox|"?Product"?,"?Blackbox', start) is not None
-    if is_blackbox and not isinstance(columns, Mapping):
+    if is_blackbox and (start.startswith(b"H ") or not isinstance(columns, Mapping)):
         raise blackbox(name)
     for beginning, why in _NO_LOG.items():
         if re.match(beginning, start, re.IGNORECASE):
@@ -223,6 +223,6 @@ def _split(row: str, mark: str | None) -> list[str]:
 
 def _number(cell: str, mark: str | None) -> float:
     try:
-        return float(cell.replace(",", "."))
+        return float(cell if mark == "," else cell.replace(",", "."))
     except ValueError:
         return np.nan

@@ -135,7 +135,7 @@ def _run(job: Callable[[], None]) -> None:
         except ConfigCompositionException as error:
             lacking = re.match(r"Could not override '(.+?)'\.", str(error))
             known = [f"+{x}" if lacking and x.startswith(f"{lacking[1]}=") else x for x in sys.argv[1:]]
-            if known == sys.argv[1:]:
+            if known == sys.argv[1:] or (lacking and lacking[1].startswith("hydra.")):
                 raise
             sys.argv[1:] = known
 

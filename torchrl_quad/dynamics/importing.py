@@ -120,15 +120,12 @@ def _completed(
     if "rotor_positions" in fields and "rotor_direction" not in fields:
         found = {k: x for k, x in found.items() if k != "rotor_direction"}  # of the file's places
     known, found = found | usable(fields), found | {k: (v, GIVEN) for k, v in fields.items()}
-    curve = found.get("thrust_map", (None,))[0]
-    asked = list(ASKED)
-    if curve is not None and np.shape(curve) == (3,) and curve[1] < 0.0 < curve[0]:  # thrust falls at first
-        asked.append("rotor_speed_min")
-    if missing := [x for x in asked if found.get(x, (None,))[0] is None]:
+    examples = _examples(known)
+    if missing := [x for x in examples if found.get(x, (None,))[0] is None]:
         why = [f": {found[x][1]}" if x in found and found[x][1] else "" for x in missing]
         names = ", ".join(f"{x} [{FIELDS[x]['unit'] or '1'}]{y}" for x, y in zip(missing, why, strict=True))
         follow = [x for x in missing if x in found and found[x][1].startswith("it follows")]
-        like = ", ".join(f"{x}={y}" for x, y in _examples(known).items() if x in missing and x not in follow)
+        like = ", ".join(f"{x}={y}" for x, y in examples.items() if x in missing and x not in follow)
         like = f"entry={entry!r}, {like}" if entry is not None else like
         raise UserValueError(
             f"{source} ({kind}) does not say {names}. Give your own numbers, in SI units and our frame, such as "
@@ -176,7 +173,7 @@ def _examples(found: Found) -> dict[str, str]:
     most = ASKED["rotor_speed_max"] if curve is None else f"{speed_at(force, curve):.4g}"
     thrust = f"[{force / max(fast, 1.0) ** 2:.2g}, 0, 0]"
     examples = ASKED | {"rotor_spin": spin, "thrust_map": thrust, "rotor_speed_max": most}
-    if curve is not None and curve[1] < 0.0 < curve[0]:
+    if curve is not None and curve[1] < 0.0 < curve[0]:  # thrust falls at first, so that rotors must not stand
         examples["rotor_speed_min"] = f"{-0.55 * curve[1] / curve[0]:.3g}"  # a tenth beyond the lowest thrust
     examples["linear_drag"] = str([float(f"{0.3 * heavy:.2g}")] * 3)
     return {name: example.replace(" ", "") for name, example in examples.items()}  # one word of a command line

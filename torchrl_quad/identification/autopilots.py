@@ -402,12 +402,9 @@ def read_dataflash(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
 
 
 def _with_signals(outputs: Stream, parameters: Mapping[str, float], name: str, notes: list[str]) -> Stream:
-    functions = {}  # the outputs of motors
-    for key, value in parameters.items():
-        found = re.fullmatch(r"SERVO(\d+)_FUNCTION", key)
-        if found and value in _MOTORS:
-            functions[_MOTORS.index(int(value))] = int(found[1])
-    assigned = [x for x in parameters if re.fullmatch(r"SERVO(\d+)_FUNCTION", x) and parameters[x] > 0.0]
+    servos = {key: re.fullmatch(r"SERVO(\d+)_FUNCTION", key) for key in parameters}
+    assigned = {int(found[1]): parameters[key] for key, found in servos.items() if found and parameters[key] > 0.0}
+    functions = {_MOTORS.index(int(value)): n for n, value in assigned.items() if value in _MOTORS}  # outputs of motors
     if parameters.get("Q_ENABLE", 0.0) or (assigned and not {0, 1, 2, 3} <= functions.keys()):
         raise WrongMotors(
             f"{name} is not the log of a quadrotor: its SERVO functions do not have motors 1 to 4, or Q_ENABLE says "

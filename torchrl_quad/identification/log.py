@@ -221,6 +221,11 @@ def _naming(path: Path) -> Iterator[None]:
         raise type(error)(said if len(said) <= _LONGEST else f"{said[:_LONGEST]} ...") from error
 
 
+def _next(name: str) -> str:
+    """The name with its last number raised by one."""
+    return re.sub(r"\d+(?=\D*$)", lambda found: str(int(found[0]) + 1), name)
+
+
 def _signals(layout: Layout, streams: Sequence[Stream], name: str, notes: list[str]) -> dict[str, Signal]:
     """Each quantity at its own rate, finite, in order of time, and in range."""
     signals = {}
@@ -236,10 +241,10 @@ def _signals(layout: Layout, streams: Sequence[Stream], name: str, notes: list[s
             f"reach {np.nanmax(np.abs(speeds.values)):.4g}, taken as rad/s"
         )
     motors = gathered["motor_command"].columns
-    last = re.sub(r"\d+(?=\D*$)", lambda found: str(int(found[0]) + 1), max(motors))  # m5 after m4
+    last = _next(max(motors))  # m5 after m4
     if last == max(motors):  # e after d
         last = f"{last[:-1]}{chr(ord(last[-1]) + 1)}"
-    next_one = re.sub(r"\d+(?=\D*$)", lambda found: str(int(found[0]) + 1), last)
+    next_one = _next(last)
     if last not in motors and next_one != last and any({last, next_one} <= stream.columns.keys() for stream in streams):
         raise WrongMotors(
             f"{last} and {next_one} look like a fifth and a sixth motor. Only drones with four rotors are fitted; if "

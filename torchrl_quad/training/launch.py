@@ -133,9 +133,9 @@ def _run(job: Callable[[], None]) -> None:
         try:
             return job()
         except ConfigCompositionException as error:
-            lacking = re.match(r"Could not override '(.+?)'\.", str(error))
+            lacking = re.match(r"Could not override '(?!hydra\.)(.+?)'\.", str(error))
             known = [f"+{x}" if lacking and x.startswith(f"{lacking[1]}=") else x for x in sys.argv[1:]]
-            if known == sys.argv[1:] or (lacking and lacking[1].startswith("hydra.")):
+            if known == sys.argv[1:]:
                 raise
             sys.argv[1:] = known
 

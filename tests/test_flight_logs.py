@@ -258,6 +258,9 @@ def test_each_fault_has_its_name_and_its_remedy(fault, table, plain, read):
     (lambda head, rows: ["# a remark", head, *rows], None),
     (lambda head, rows: ["%mode," + head, *(f"MANUAL,{x}" for x in rows)], None),  # as rostopic writes
     (lambda head, rows: [head, *(f"{row}," for row in rows)], None),
+    (lambda head, rows: [f"{head},note", *(f"{row},#N/A" for row in rows)], None),
+    (lambda head, rows: ["[", *rows], "is JSON, or like it. Export it"),
+    (lambda head, rows: ["\r".join([head, *rows])], "carriage returns alone. Save it as CSV with line feeds"),
     (lambda head, rows: rows, "its first row holds numbers. Put a row above it"),
     (lambda head, rows: ["made by a program", head, *rows], "names the columns: delete the lines above"),
     (lambda head, rows: [head, *(f"12:00:{row}" for row in rows)], "the time in t is no number, but '12:00:0"),

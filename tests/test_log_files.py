@@ -48,6 +48,7 @@ def test_a_ulog_is_read_in_our_frames_with_what_leaves_for_the_motors(tmp_path):
     np.testing.assert_allclose(log.setpoint["position"], held, atol=1e-5)
     none = tmp_path / "flight.ulg", {"battery_voltage": "batery.voltage"}
     refuses("no column batery.voltage, named for", read_log, *none, error=MissingColumns)
+    refuses("such a log has its own clock", read_log, none[0], {"time": "t"}, error=MissingColumns)
     # Older firmware logs pulses; a logger that loses half a second leaves a gap.
     t, _ = messages.pop("actuator_motors")
     signal = flight(t - 5.0)["motor_command"][:, [3, 1, 0, 2]]
@@ -96,6 +97,9 @@ def test_the_parameters_of_a_ulog_say_which_outputs_are_motors_and_which_drones_
     log = read_log(write_ulog(path, messages, limits | functions | {k: float(v) for k, v in PLACES.items()}))
     same(log)
     assert "motor commands are in actuator_outputs#1, pulses from 1075 to 1950 us, placed by CA_ROTOR" in str(log)
+    charge = messages["battery_status"][0], {"voltage_v": ("float", 0.0 * messages["battery_status"][0])}
+    messages |= {"battery_status": charge, "battery_status#1": messages["battery_status"]}
+    same(read_log(write_ulog(path, messages, limits | functions | {k: float(v) for k, v in PLACES.items()})))
     asleep = messages | {"actuator_armed": (t, {"armed": ("uint8_t", 0.0 * t)})}
     asleep["actuator_outputs#1"] = (t, {"output": ("float", 0.0 * still + 900.0)})
     twelve = messages | {"actuator_motors": (t, {"control": ("float", np.tile(signal, 3))})}

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from torchrl_quad.deploy.frames import Convention, px4
-from torchrl_quad.identification.errors import Remedy, WrongFrame, WrongMotors, WrongQuaternion, WrongUnit, in_units
+from torchrl_quad.identification.errors import Remedy, WrongFrame, WrongQuaternion, WrongUnit, in_units
 from torchrl_quad.identification.layouts import G
-from torchrl_quad.identification.pieces import OFF
-from torchrl_quad.identification.signals import Array, Mask, Signal, body_rates, convolved, slope, smooth
+from torchrl_quad.identification.signals import Array, Mask, Signal, body_rates, slope, smooth
 from torchrl_quad.rotations import rotate, rotate_inverse
 
 MAX_LAG = 0.3  # [s] between streams
@@ -38,64 +35,11 @@ _DOWN: Remedy = {  # the quaternion times (0, 1, 0, 0)
     "factor": (-1.0, 1.0, 1.0, -1.0),
     "when": "the body of the attitude has y right and z down",
 }
-LEAST_HOVER = 0.05  # of the full command: a drone of which this is more than hovering lifts itself a hundred times
-_COMMANDS = (  # factor, offset, least, largest, and what they are
-    (0.01, 0.0, 0.0, 101.0, "percents"),
-    (1e-3, 1000.0, 700.0, 2600.0, "pulses from 1000 to 2000 us"),
-    (1.0 / 255.0, 0.0, 0.0, 255.5, "counts of 8 bits"),
-    (5e-4, 0.0, 0.0, 2000.5, "DShot commands up to 2000"),
-    (1.0 / 1999.0, 48.0, 48.0, 2047.5, "DShot values from 48 to 2047"),
-    (1.0 / 65535.0, 0.0, 0.0, 65535.5, "counts of 16 bits"),
-)
-_X = np.array([[1, 1, -1, -1], [-1, 1, 1, -1], [1, -1, 1, -1]])  # roll, pitch, yaw by our motors, yaw either way
-_PLUS = np.array([[0, 1, 0, -1], [-1, 0, 1, 0], [1, -1, 1, -1]])  # of rotors in front, left, behind and right
+_EULER: list[Remedy] = [  # angles as in aviation, beside positions with z up
+    {"quantity": "euler", "factor": (1.0, -1.0, -1.0), "when": "the angles are of a body with y right and z down"},
+]
+_EULER += [{**_EULER[0], "offset": (0.0, 0.0, np.pi / 2.0), "when": f"{_EULER[0]['when']}, and yaw counts from north"}]
 _AXES = ("roll", "pitch", "yaw")
-_ORDERS = list(itertools.permutations(range(4)))
-
-
-def check_motors(signal: Signal) -> list[str]:
-    """Refuse motor commands that are counts, pulses, percents or speeds; a note on some just outside of 0 to 1."""
-    low, high = float(signal.values.min()), float(signal.values.max())
-    full = float(np.percentile(signal.values.mean(-1), 95))
-    below = signal.values < -0.01
-    if -1.01 < low < -0.01 and high <= 1.03 and np.ptp(signal.values[below]) < 1e-3 and full > LEAST_HOVER:
-        return [f"{signal} is {low:.3g} in {below.mean():.0%} of its samples, as where motors are disarmed: taken as 0"]
-    if low >= -0.01 and high <= 1.03:
-        if OFF < full < LEAST_HOVER:
-            raise WrongUnit(
-                f"{signal} reaches {high:.3g} at most, and must run from 0 to 1, the full command: no drone flies with "
-                "so little of it. Name the commands, or say by Columns(names, scale=...) what is full."
-            )
-        return [f"{signal} reaches {low:.3f} to {high:.3f}: clipped to 0 to 1"] if low < 0.0 or high > 1.0 else []
-    begun = float(signal.values.min(where=signal.values > 0.0, initial=high))  # some are 0 until they are armed
-    remedies = [
-        {"quantity": signal.field, "factor": factor, "offset": offset, "when": f"they are {what}"}
-        for factor, offset, least, most, what in _COMMANDS
-        if least <= (begun if low == 0.0 else low) and high <= most and (full - offset) * factor > 4.0 * LEAST_HOVER
-    ]
-    if _turn_one_way(signal.values) and np.abs(signal.values).max() > 50.0:
-        remedies.append({"quantity": signal.field, "name": "rotor_speed", "when": "they are rotor speeds in rad/s"})
-    none = "" if remedies else " It is like neither percents, pulses, DShot, counts nor speeds of rotors."
-    raise WrongUnit(
-        f"{signal} runs from {low:.4g} to {high:.4g}, and must run from 0 to 1, the full command.{none}", *remedies
-    )
-
-
-def check_speeds(signal: Signal, most: float) -> list[str]:
-    """Refuse rotor speeds that are none."""
-    values = signal.values[np.isfinite(signal.values).all(-1)]
-    if not len(values) or (_turn_one_way(values) and 20.0 < np.abs(values).max() <= most):
-        return []
-    raise WrongUnit(
-        f"{signal} runs from {values.min():.4g} to {values.max():.4g}: speeds of rotors [rad/s] keep their sign, and "
-        f"reach 20 to {most:g}.",
-        {"quantity": "rotor_speed", "factor": np.pi / 30.0, "when": "they are revolutions per minute"},
-    )
-
-
-def _turn_one_way(values: Array) -> bool:
-    least, most = values.min(0), values.max(0)
-    return bool((np.minimum(np.abs(least), np.abs(most)) * (least * most < 0.0) <= 0.02 * np.abs(values).max()).all())
 
 
 def check_angles(signal: Signal) -> None:
@@ -142,7 +86,7 @@ def check_velocity(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: f
         return
     given = smooth(at["velocity"], dt)
     fit, factor, _ = _compare(given, derived, dt, moving)
-    if not 0.6 < factor < 1.6:
+    if not 0.6 < factor < 1.6 or (fit > 0.95 and not 0.8 < factor < 1.25):
         size = "position" if factor < 1.0 else signal.field
         ratio = min(factor, 1.0 / factor)
         lengths = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
@@ -155,7 +99,8 @@ def check_velocity(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: f
                 f"the {size.partition('_')[0]} is in",
                 **{k: x for k, x in lengths.items() if 0.8 < ratio / x < 1.25},
             ),
-            {"quantity": signal.field, "drop": True},
+            _clock(factor),
+            {"quantity": signal.field, "drop": True, "when": "the position is right"},
         )
     frames = ("world", "body") if signal.field == "velocity" else ("body", "world")
     turn, name = (rotate, "velocity_body") if frames[0] == "world" else (rotate_inverse, "velocity")
@@ -204,7 +149,7 @@ def check_specific_force(at: Mapping[str, Array], signals: Mapping[str, Signal],
     if fit >= -0.5:
         raise WrongFrame(f"{said} (correlation {fit:.2f}).", drop)
     flips = sorted(([1, -1, -1], [1, 1, -1], [-1, -1, -1]), key=lambda flip: -(force * flip * due).sum())
-    remedies = [{"quantity": "acceleration", "factor": flip, "when": "it counts so"} for flip in flips]
+    remedies = [{"quantity": "acceleration", "factor": flip, "when": "the accelerometer counts so"} for flip in flips]
     raise WrongFrame(f"{said} along the other direction (correlation {fit:.2f}).", _NED, *remedies, drop)
 
 
@@ -237,17 +182,27 @@ def check_rates(
     fits = {name: _compare(b, a, dt, moving) for name, (a, b) in trials.items()}
     fit, factor, lag = fits["as given"]
     best = max(fits, key=lambda name: fits[name][0])
+    turn, apart = _turn(smooth(gyro, dt), right, dt, moving)
+    turned = _compare(smooth(gyro @ turn.T, dt), right, dt, moving)[0]
+    told = f"{signal} correlates with the derivative of {given} by {fit:.2f} as given, and"
+    if turned > max(0.8, fits[best][0] + SURE):
+        raise WrongFrame(
+            f"{told} by {turned:.2f} if the body of the attitude is {apart}. Bring all of the log into one body: x "
+            "forward, y left, z up."
+        )
     if fits[best][0] > max(0.5, fit + SURE):
-        told = f"{signal} correlates with the derivative of {given} by {fit:.2f} as given, and by {fits[best][0]:.2f}"
+        told += f" by {fits[best][0]:.2f}"
         if best in hypotheses:
             raise WrongQuaternion(
                 f"{told} if the quaternion is {best}. We need w x y z, from body to world.",
                 {"quantity": "quaternion", **_QUATERNIONS[best]},
             )
         if best == "in the world frame":
-            raise WrongFrame(f"{told} if the gyro is in the world frame.", {"quantity": signal.field, "drop": True})
+            also = f", or the body of the attitude {apart}" if turned > fits[best][0] - SURE else ""
+            drop = {"quantity": signal.field, "drop": True}
+            raise WrongFrame(f"{told} if the gyro is in the world frame{also}.", drop)
         flip = {"quantity": signal.field, "factor": tuple(signs[best])}
-        raise WrongFrame(f"{told} {best}.", *([_NED] if signs[best] is FRD else []), flip)
+        raise WrongFrame(f"{told} {best}.", *([_NED, *_EULER] if signs[best] is FRD else []), flip)
     said = f"{signal} is {factor:.3g} times the derivative of {given}: it is in"
     for unit, scale in (("degrees", np.pi / 180.0), ("milliradians", 1e-3)):
         if 1.0 / 3.0 < factor * scale < 3.0 and fit > 0.2:
@@ -261,12 +216,30 @@ def check_rates(
             "scalar last or inverse, or the gyro in another frame. Name columns that belong together.",
             derive,
         )
-    if not 1.0 / 3.0 < factor < 3.0:
+    if not 1.0 / 3.0 < factor < 3.0 or (fit > 0.95 and not 0.7 < factor < 1.4):
         near = given.field == "euler" and 1.0 / 3.0 < factor * 180.0 / np.pi < 3.0
         degrees = in_units("euler", "the angles are in", degrees=np.pi / 180.0) if near else []
-        raise WrongUnit(f"{said} an unknown unit.", *degrees, derive)
+        raise WrongUnit(f"{said} an unknown unit, or the clock is.", *degrees, _clock(factor), derive)
     size = f", {factor:.2f} times as large" if not 0.8 < factor < 1.25 else ""
     return f"{signal} fits the attitude: correlation {fit:.2f}, {1000.0 * lag:+.0f} ms late{size}"
+
+
+def _clock(factor: float) -> Remedy:
+    """For what is ``factor`` times its derivative by a clock."""
+    return {"quantity": "time", "factor": float(f"{1.0 / factor:.2g}"), "when": "the clock is no clock of seconds"}
+
+
+def _turn(gyro: Array, right: Array, dt: float, moving: Mask) -> tuple[Array, str]:
+    """The rotation (3, 3) that brings a gyro closest to right rates (Kabsch 1976), and how it is told."""
+    speeds = [np.linalg.norm(x, axis=-1, keepdims=True) for x in (gyro, right)]
+    late = _compare(speeds[0], speeds[1], dt, moving)[2]
+    a, b = np.roll(gyro, -round(late / dt), 0)[moving], right[moving]
+    u, _, v = np.linalg.svd(b.T @ a)
+    turn = u * (1.0, 1.0, np.linalg.det(u @ v)) @ v
+    axis = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    angle = np.degrees(np.arctan2(np.linalg.norm(axis), np.trace(turn) - 1.0))
+    about = ", ".join(f"{x:.1f}" for x in -axis / max(np.linalg.norm(axis), 1e-9))
+    return turn, f"turned by {angle:.0f} degrees about ({about}) against the gyro's"
 
 
 def _check_by_thrust(
@@ -330,6 +303,7 @@ def check_lean(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float
             f"{said.format('another way')}the correlation is {given[0]:.2f} as given, and {abs(best[0]):.2f} if the "
             f"world of position and velocity is {how}. Bring both and the attitude into one world, with z up.",
             _NED,
+            *_EULER,
         )
     sides = [_compare(tilt[:, [k]], pull[:, [k]], dt, moving)[0] for k in (0, 1)]
     apart = any(x < 0.3 and min(tilt[rows, k].std(), pull[rows, k].std()) >= LEAN for k, x in enumerate(sides))
@@ -351,70 +325,6 @@ def check_lean(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float
             *in_units("position", "the position is in", **near),
             *degrees,
         )
-
-
-def check_order(
-    at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float, pieces: Sequence[tuple[int, int]]
-) -> str:
-    """Refuse motors in another order than the one in which they turn the drone, as far as the flight tells it."""
-    signal, rows = signals["motor_command"], np.concatenate([np.arange(start, stop) for start, stop in pieces])
-    parts = (rows, rows[: len(rows) // 2], rows[len(rows) // 2 :])  # what is chance in one half is not in the other
-
-    command = at["motor_command"][rows]
-    spread, alike = command.std(0), np.ptp(command, 1).max() < 1e-6
-    if spread.max() > 0.01 and (alike or spread.min() < 1e-3 * spread.max()):
-        place = ("front left", "back left", "back right", "front right")[int(spread.argmin())]
-        which = "are the same for all motors" if alike else f"do not change for the motor {place}"
-        raise WrongMotors(f"In flight {signal} {which}. Name the commands of all four.")
-
-    def worth_of(signs: Array, late: int = 0) -> Array:
-        fits = turning_fits(np.roll(at["angular_velocity"], -late, 0), at["motor_command"], dt, parts, signs)
-        return fits[..., 0] + fits[..., 1] + np.abs(fits[..., 2])  # yaw: which turn alike, not which way
-
-    worth = worth_of(_X)
-    best = int(worth[0].argmax())
-    if worth[:, best].min() < 0.4:
-        return f"the order of {signal} was not checked: the flight hardly tells it ({worth[0, best]:.2f} of 3)"
-    plus = worth_of(_PLUS)
-    if (plus.max(1) > worth.max(1) + 0.3).all():
-        raise WrongMotors(
-            f"{signal} turn the drone as rotors in front, left, behind and right do (correlations add up to "
-            f"{plus[0].max():.2f}, and in an X to {worth[0, best]:.2f}): only rotors in an X are read."
-        )
-    if (worth[:, best] > worth[:, 0] + 0.15).all() and worth[0, best] > worth[0, 0] + 0.2:
-        reach, step = round(MAX_LAG / dt), max(1, round(0.02 / dt))
-        shifts = range(-reach, reach + 1, step)
-        apart = np.array([worth_of(_X, k)[0] for k in shifts])  # a gyro on another clock
-        if apart.max(0).argmax() == 0:
-            late = 1000.0 * dt * shifts[int(apart[:, 0].argmax())]
-            return f"the order of the motors fits how the drone turns if the gyro is {late:.0f} ms late"
-        raise WrongMotors(
-            f"{signal} explain how the drone turns less in the order front left, back left, back right, front right "
-            f"(correlations about roll, pitch and yaw add up to {worth[0, 0]:.2f}) than in another "
-            f"({worth[0, best]:.2f}).",
-            {"quantity": signal.field, "order": _ORDERS[best]},
-        )
-    others = float(np.delete(worth[0], 0).max())
-    return (
-        f"the order of the motors fits how the drone turns: {worth[0, 0]:.2f} of 3, and {others:.2f} in another order"
-    )
-
-
-def turning_fits(rates: Array, command: Array, dt: float, parts: Sequence[NDArray[np.int_]], signs: ArrayLike) -> Array:
-    """How well the motors explain the angular acceleration about each axis in each order, as correlations
-    (parts, 24, 3); ``signs`` (3, 4) are those of roll, pitch and yaw by each motor."""
-    mixing = np.zeros((len(_ORDERS), 4, 3))  # the signs of a command in each order, about each axis
-    for mix, order in zip(mixing, _ORDERS, strict=True):
-        mix[list(order)] = np.transpose(signs)
-    weights = np.exp(-dt / 0.04 * np.arange(max(2, round(0.2 / dt))))  # rotors follow with a lag, of 0.04 s or so
-    thrusts = convolved(np.pad(command**2, ((len(weights) - 1, 0), (0, 0)), "edge"), weights / weights.sum())
-    thrusts, turning = smooth(thrusts, dt, 0.08), slope(rates, dt)
-    fits = []
-    for rows in parts:
-        late, turned = (x[rows] - x[rows].mean(0) for x in (thrusts, turning))
-        size = np.einsum("pka,kl,pla->pa", mixing, late.T @ late, mixing) * (turned**2).sum(0)
-        fits.append(np.einsum("pka,ka->pa", mixing, late.T @ turned) / np.sqrt(np.maximum(size, 1e-24)))
-    return np.array(fits)
 
 
 def _compare(late: Array, early: Array, dt: float, moving: Mask) -> tuple[float, float, float]:

@@ -21,10 +21,10 @@ from torchrl_quad.dynamics.rigid_body import RigidBodyState
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.files import replacing
 from torchrl_quad.identification import prediction
-from torchrl_quad.identification.checks import turning_fits
 from torchrl_quad.identification.errors import TooShort
 from torchrl_quad.identification.fitting import MAX_ITERATIONS, Linear, Problem, State, bootstrap, covariance, minimise
 from torchrl_quad.identification.log import FlightLog
+from torchrl_quad.identification.motor_checks import turning_fits
 from torchrl_quad.identification.parameters import FIELDS, NEED_MASS, UNKNOWNS, Estimate, Model, report, unknowns_of
 from torchrl_quad.identification.prediction import CONSTANT_VELOCITY, PAST, Windows
 from torchrl_quad.identification.result import IdentificationResult

@@ -163,14 +163,17 @@ def gather(layout: Layout, streams: Sequence[Stream], name: str) -> dict[str, Si
     owner = {column: stream for stream in reversed(streams) for column in stream.columns}
     found = {}
     for quantity, choices in layout.columns.items():
-        choice = next((c for c in choices if all(column in owner for column in c.names)), None)
-        if choice is None:
+        there = [c for c in choices if all(column in owner for column in c.names)]
+        if not there:
             if quantity in layout.required:
                 missing = sorted({column for c in choices for column in c.names} - owner.keys())
                 raise MissingColumns(
                     f"{name} has no column {', '.join(missing)}, named for {quantity}. {_columns_there(owner, missing)}"
                 )
             continue
+        # Autopilots write zeros where nothing is measured, as of a first battery that is not there.
+        measured = (c for c in there if any(np.any(owner[column].columns[column]) for column in c.names))
+        choice = next(measured, there[0])
         stream = owner[choice.names[0]]
         if any(owner[column] is not stream for column in choice.names):
             raise UnreadableLog(

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from torchrl_quad.deploy.frames import Convention
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
-from torchrl_quad.identification import checks
+from torchrl_quad.identification import checks, motor_checks
 from torchrl_quad.identification.errors import (
     GapsTooLarge,
     LogError,
@@ -191,7 +191,7 @@ def _read(
     checks.check_lean(at, signals, step, moving)
     checks.check_specific_force(at, signals, step, moving)
     segments, found = find_pieces(at, valid, step, path.name, clearance, max_gap, min_duration)
-    notes.append(checks.check_order(at, signals, step, segments))
+    notes.append(motor_checks.check_order(at, signals, step, segments))
     setpoint = {q.removeprefix("setpoint."): x for q, x in at.items() if q.startswith("setpoint.")}
     present = {q.partition(".")[0] for q in at}
     motion: Any = {q: at.get(q) for q in ("position", "quaternion", "velocity", "angular_velocity", "acceleration")}
@@ -232,7 +232,7 @@ def _signals(layout: Layout, streams: Sequence[Stream], name: str, notes: list[s
     gathered = gather(layout, streams, name)
     if "rotor_speed" in gathered:
         speeds = gathered.pop("rotor_speed")
-        notes += checks.check_speeds(speeds, FULL_SPEED)
+        notes += motor_checks.check_speeds(speeds, FULL_SPEED)
         gathered["motor_command"] = replace(speeds, values=np.abs(speeds.values) / FULL_SPEED)
         gathered.pop("battery_voltage", None)
         notes.append(
@@ -274,7 +274,7 @@ def _signals(layout: Layout, streams: Sequence[Stream], name: str, notes: list[s
         turned = theirs.back({"quaternion": from_euler(euler.values)})["quaternion"]
         signals["quaternion"] = replace(euler, values=turned)
     if signals["motor_command"].field == "motor_command":
-        notes += checks.check_motors(signals["motor_command"])
+        notes += motor_checks.check_motors(signals["motor_command"])
     return signals
 
 
@@ -284,6 +284,8 @@ def _grid(signals: Mapping[str, Signal], main: Sequence[Signal], dt: float | Non
     step = dt or max(round(attitude.step, 5), LEAST_STEP)
     if not 0.0 < attitude.step < 0.5:
         units = in_units("time", "it is in", milliseconds=1e-3, microseconds=1e-6, nanoseconds=1e-9)
+        counts = {f"at {hertz} Hz": 1.0 / hertz for hertz in (50, 100, 200, 250, 400, 500) if attitude.step == 1.0}
+        units = in_units("time", "it counts samples", **counts) + units
         raise WrongUnit(f"{name}: the clock steps by {attitude.step:.4g} s, which is not a flight.", *units)
     start, stop = max(s.time[0] for s in main), min(s.time[-1] for s in main)
     span = stop - start

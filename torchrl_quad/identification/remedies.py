@@ -7,7 +7,7 @@ ours), ``name`` (as which quantity), ``drop``; ``when`` says on what it depends.
 
 from __future__ import annotations
 
-import itertools
+import collections
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -18,7 +18,7 @@ from torchrl_quad.deploy.frames import Convention
 from torchrl_quad.identification.errors import LogError, Remedy
 from torchrl_quad.identification.layouts import RIVALS, Columns, Layout
 
-_DEEPEST, _MOST = 4, 12  # faults of one log that are mended together, and how often it is read for that
+_DEEPEST, _MOST = 4, 30  # faults of one log that are mended together, and how often it is read for that
 
 
 @dataclass(frozen=True)
@@ -83,26 +83,20 @@ class Mended:
 
 def remedy_for(error: LogError, start: Mended, read: Callable[[Mended], object]) -> Mended | None:
     """The fewest remedies with which the log reads: one alone, else with those of the errors that come next."""
-    left = itertools.count(_MOST, -1)
-
-    def found(error: LogError, before: Mended, depth: int) -> Mended | None:
-        for remedy in error.remedies if depth else ():
-            mended = before.by(remedy)
-            if mended is None:
-                continue
-            if next(left) <= 0:
+    queue, reads = collections.deque([(error, start, 1)]), 0
+    while queue:
+        error, before, depth = queue.popleft()
+        for mended in filter(None, map(before.by, error.remedies)):
+            if reads == _MOST:
                 return None
+            reads += 1
             try:
                 read(mended)
             except LogError as further:
-                deeper = found(further, mended, depth - 1)
-                if deeper is not None:
-                    return deeper
+                queue.extend([(further, mended, depth + 1)] if depth < _DEEPEST else [])
             else:
                 return mended
-        return None
-
-    return next((x for depth in range(1, _DEEPEST + 1) if (x := found(error, start, depth))), None)
+    return None
 
 
 def _places(convention: Convention, quantity: str, count: int) -> list[int]:

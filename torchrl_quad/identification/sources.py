@@ -35,6 +35,8 @@ _CUT = "Cut it into shorter logs."
 _NO_LOG = {  # by what it begins with
     rb"version https://git-lfs": "stands for a file that was not downloaded. Write: git lfs pull",
     rb"\s*<(!doctype )?html": "is a web page. Download the file itself, which GitHub calls raw.",
+    rb"\s*[\[{]": "is JSON, or like it. Export it as CSV.",
+    rb"[\t -~]+\r[\t\r -~]+\Z": "ends its lines with carriage returns alone. Save it as CSV with line feeds.",
     rb"FMT, *128": "is the text of a dataflash log. Give its .bin.",
     rb"rosbag2_bagfile_information": "only describes a ROS bag. Give the folder that it lies in.",
 }
@@ -76,6 +78,8 @@ def _read(file: io.BufferedReader[Any], name: str, columns: Asked, most: int) ->
             raise UnreadableLog(f"{name} {why}")
     for magic, (reader, preset) in _READERS.items():
         if start.startswith(magic):
+            if isinstance(columns, Mapping) and "time" in columns:
+                raise MissingColumns(f"{name}: columns names a time, and such a log has its own clock. Leave time out.")
             layout = LAYOUTS[preset] if columns is None else choose(columns, LAYOUTS[preset])
             data = b"".join(_counted(iter(lambda: file.read(1 << 20), b""), name, most))
             streams, notes = reader(data, name)
@@ -189,7 +193,7 @@ def _rows(lines: Iterator[bytes], name: str) -> Iterator[str]:
         if not begun and text[:1] in ("#", "%"):
             remark = text.lstrip("#% ") or remark
             continue
-        text = text.partition("#")[0].strip(" ") if begun and "#" in text else text
+        text = re.sub(r"#(?!N/A).*", "", text).strip(" ") if begun and "#" in text else text
         if not begun and text:
             begun, mark = True, _mark(remark)
             cells, names = (x.strip(mark).split(mark) for x in (text, remark))

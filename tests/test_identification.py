@@ -419,7 +419,7 @@ def test_euler_angles_and_velocities_of_the_body_become_ours(tmp_path):
 def test_a_gyro_on_another_clock_is_no_other_order_of_motors(tmp_path):
     rows = np.genfromtxt(REAL, delimiter=",", names=True)
     late = {x: np.roll(rows[x], 10 * x.startswith("imu_gyro")) for x in rows.dtype.names}
-    assert "fits how the drone turns if the gyro is " in str(read_log(write_csv(tmp_path / "late.csv", late)))
+    assert "fits how the drone turns if its rates are " in str(read_log(write_csv(tmp_path / "late.csv", late)))
 
 
 def test_columns_and_layouts_say_which_of_their_fields_is_wrong():

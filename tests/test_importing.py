@@ -220,7 +220,7 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_th
     ("x.sdf", sdf(FRAME.replace("izz", "jzz")), "'base_link' has a mass, and no ixx, iyy and izz"),
     ("x.sdf.jinja", "<sdf>{% if heavy %}<mass>5</mass>{% endif %}</sdf>", "a template of Jinja, with '{% if heavy"),
     ("x.urdf", URDF.format("cf", 0).replace("value='0.4'", "value='0'"), "mass .* it follows from thrust2weight"),
-    ("x.json", '{"k_eta": 1, "k_eta": 2}', "not a JSON file: .*k_eta.* has a name twice"),
+    ("x.json", '{"k_eta": 1, "k_eta": 2}', "not JSON that can be read: .*k_eta.* has a name twice"),
     ("x.json", json.dumps({**L2F, "J_inv": np.eye(3).tolist()}), "inertia .* J_inv is not the inverse of J"),
     ("x.yaml", json.dumps(VISFLY | {"motor_omega_min": None, "thrust_map": [4e-7, -1e-5, 0]}), "rotor_speed_min=13.8"),
     ("x.yaml", "{mass: 1, inertia: [1, 1, 1], T_bm: [0, 0, 1]}", "this file is of no kind that is known"),

@@ -27,13 +27,15 @@ def contradictions(fields: Mapping[str, ArrayLike]) -> Iterator[str]:
     inertia, k2, k1 = drone["inertia"], drone["thrust_map"][..., 0], drone["thrust_map"][..., 1]
     mass, low, high = (drone[x].reshape(-1) for x in ("mass", "rotor_speed_min", "rotor_speed_max"))
     units = "Check the order of the axes and the unit: 1 g cm2 is 1e-7 kg m2"
-    if (2.0 * inertia.max(-1) > inertia.sum(-1) * (1.0 + 1e-5)).any():
-        yield f"inertia {listed(inertia)} kg m2: in a body none of the three exceeds the sum of the others. {units}"
+    if (twisted := 2.0 * inertia.max(-1) > inertia.sum(-1) * (1.0 + 1e-5)).any():
+        worst = listed(inertia[twisted])
+        yield f"inertia {worst} kg m2: in a body none of the three exceeds the sum of the others. {units}"
     arm = np.sqrt((drone["rotor_positions"] ** 2).sum(-1)).max(-1)
     radius = np.sqrt(inertia.max(-1) / mass)
     if (unlike := (radius > 2.0 * arm) | (arm > 10.0 * radius)).any():
         worst = unlike.argmax()
         arm, radius, one = (np.broadcast_to(x, unlike.shape).flat[worst] for x in (arm, radius, mass))
+        inertia = np.broadcast_to(inertia, (*unlike.shape, 3))[worst]
         yield (
             f"inertia {listed(inertia)} kg m2: with a mass of {one:.4g} kg it is that of a ring of {radius:.3g} m "
             f"radius, and the farthest rotor is {arm:.3g} m from the centre. {units}; mass is in kg, rotor_positions "

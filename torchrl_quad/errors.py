@@ -44,7 +44,7 @@ def needing(message: str, kind: type[Exception] = MissingPackage) -> Iterator[No
     try:
         yield
     except ImportError as error:
-        raise kind(message) from error
+        raise kind(f"{message} ({one_line(error)})") from error
 
 
 class DroneWarning(UserWarning):

@@ -124,10 +124,15 @@ def check_flown(controller: FlightController, flown: QuadrotorParams, dt: float)
     believed, true = ((_numbers(x.inertia), _numbers(x.motor_time_constant)) for x in (nominal, flown))
     gain = _numbers(nominal.rate_gain) * believed[0] / true[0] * stronger
     if not rate_loop(nominal, dt, gain=gain, motor_time_constant=true[1]).is_stable.all():
+        parts = (
+            ("an inertia of {} kg m2", true[0], believed[0]),
+            ("motors of {} s", true[1], believed[1]),
+            ("rotors that give {} times the torque", stronger.round(2), np.ones_like(stronger)),
+        )
+        apart = [(how.format(listed(x)), listed(y)) for how, x, y in parts if not np.allclose(x, y, rtol=0.01)]
         raise UserValueError(
-            f"drone: in steps of dt={dt:g} s the rate loop is unstable with an inertia of {listed(true[0])} kg m2, "
-            f"motors of {listed(true[1])} s, and rotors that give {listed(stronger.round(2))} times the torque, since "
-            f"its gains are for {listed(believed[0])}, {listed(believed[1])} and 1. "
+            f"drone: in steps of dt={dt:g} s the rate loop is unstable with {', '.join(x for x, _ in apart)}, since "
+            f"its gains are for {', '.join(y for _, y in apart)}. "
             + ("List its rotors in the order of the controller's. " if (stronger < 0.2).any() else "")
             + "Choose them nearer to these, a smaller dt, or a drone with a lower rate_gain."
         )

@@ -45,7 +45,7 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(text, object_pairs_hook=_once)
     except (ValueError, RecursionError) as error:
-        raise UserValueError(f"{path}: not a JSON file: {one_line(error)}.") from None
+        raise UserValueError(f"{path}: not JSON that can be read: {one_line(error)}.") from None
 
 
 def _once(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
@@ -179,7 +179,7 @@ def _flightmare(said: Said) -> Found:
         found["rotor_speed_max"] = speed_at(most, curve), "at thrust_max, before motor_omega_max"
     if (squares := said("quad_drag_coeffs", 3)) is not None and (areas := said("cross_sections", 3)) is not None:
         found["quadratic_drag"] = 0.5 * 1.225 * squares * areas, "of quad_drag_coeffs and cross_sections, in air"
-    if (gravity := said("gravity", *np.shape(said.data.get("gravity", ())))) is not None:
+    if (gravity := said("gravity", *[3] * isinstance(said.data.get("gravity"), list))) is not None:
         found["gravity"] = np.linalg.norm(gravity), ""
     places = [said(f"tbm_{where}", 3) for where in ("fr", "bl", "br", "fl")]
     if all(x is not None for x in places):

@@ -123,7 +123,7 @@ def build_disturbances(
         drawn = drawn or DroneRandomization(options["randomize"], worn, dynamics.plant_fields)
         chosen["randomize"] = drawn
         for params in drawn.liveliest(dynamics.nominal):
-            check_flown(dynamics, params, "randomize: a ")
+            check_flown(dynamics, params, "randomize: a drawn ")
     if options["wind"] is not None:
         chosen["wind"] = build(Wind, "wind", options["wind"])
     noise, delay = options["observation_noise"] or {}, options["observation_delay"]

@@ -96,7 +96,7 @@ def _axis(source: str, axis: Any, start: Any, centres: Any, rotations: Any, is_l
             f"{source}: its gates are flown along one of their axes, and their order does not show which. Give axis="
             f"{' or '.join(map(repr, known))}. Rotations are read as w, x, y, z, or as roll, pitch and yaw."
         )
-    if axis is not None and axis not in known:
+    if axis is not None and axis not in [*known]:
         raise UserValueError(f"{source}: axis must be one of {', '.join(known)}; got {shown(axis)}.")
     return axis or fit[0]
 

@@ -405,11 +405,10 @@ def _with_signals(outputs: Stream, parameters: Mapping[str, float], name: str, n
     servos = {key: re.fullmatch(r"SERVO(\d+)_FUNCTION", key) for key in parameters}
     assigned = {int(found[1]): parameters[key] for key, found in servos.items() if found and parameters[key] > 0.0}
     functions = {_MOTORS.index(int(value)): n for n, value in assigned.items() if value in _MOTORS}  # outputs of motors
-    if parameters.get("Q_ENABLE", 0.0) or (assigned and not {0, 1, 2, 3} <= functions.keys()):
-        raise WrongMotors(
-            f"{name} is not the log of a quadrotor: its SERVO functions do not have motors 1 to 4, or Q_ENABLE says "
-            "that it has wings. Only quadrotors are fitted."
-        )
+    wings = "Q_ENABLE says that it has wings" if parameters.get("Q_ENABLE", 0.0) else ""
+    few = "its SERVO functions lack one of motors 1 to 4" if assigned and not {0, 1, 2, 3} <= functions.keys() else ""
+    if wings or few:
+        raise WrongMotors(f"{name} is not the log of a quadrotor: {wings or few}. Only quadrotors are fitted.")
     frame = int(parameters.get("FRAME_CLASS", 1))
     if frame in _FRAMES or len(functions) > 4:
         many = _FRAMES.get(frame, str(len(functions)))

@@ -107,7 +107,8 @@ def check_order(
         apart = np.array([worth_of(_X, k)[0] for k in shifts])  # a gyro on another clock
         if apart.max(0).argmax() == 0:
             late = 1000.0 * dt * shifts[int(apart[:, 0].argmax())]
-            return f"the order of the motors fits how the drone turns if the gyro is {late:.0f} ms late"
+            when = f"{abs(late):.0f} ms {'late' if late > 0.0 else 'early'}"
+            return f"the order of the motors fits how the drone turns if its rates are {when}"
         raise WrongMotors(
             f"{signal} explain how the drone turns less in the order front left, back left, back right, front right "
             f"(correlations about roll, pitch and yaw add up to {worth[0, 0]:.2f}) than in another "

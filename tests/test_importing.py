@@ -84,6 +84,17 @@ AGILICIOUS |= {"motor_omega_max": 2000, "kappa": 0.022, "thrust_max": 8, "aero_c
 AGILICIOUS |= {"omega_max": [10, 10, 4]}
 FLIGHTMARE = "rgb_camera: {on: yes}\n"
 FLIGHTMARE += "quadrotor_dynamics: {mass: 0.73, arm_l: 0.17, thrust_map: [1.3e-6, 0, 0], kappa: 0.016, motor_tau: 0.03}"
+ROTORS = {"mass": 0.7, "inertia": {"xx": 0.007, "xy": 0, "xz": 0, "yy": 0.008, "yz": 0, "zz": 0.012}}
+OMNI = {"rotor_angles": [0, np.pi / 2, np.pi, -np.pi / 2], "arm_lengths": [0.2] * 4, "directions": [-1, 1, -1, 1]}
+OMNI |= {"force_constants": [8e-6] * 4, "moment_constants": [1.28e-7] * 4, "max_rotation_velocities": [838] * 4}
+OMNI = ROTORS | {"drag_coef": 0.2, "rotor_configuration": OMNI | {"num_rotors": 4}}
+ROTOR = {"arm_length": 0.2, "rotor_force_constant": 8e-6, "rotor_moment_constant": 0.016}
+ROTORS["rotor_configuration"] = {
+    str(k): ROTOR | {"angle": (np.pi / 2) * k, "direction": -((-1) ** k)} for k in (0, 2, 1, 3)
+}
+PLUS = {"rotor_positions": [(0.2, 0), (0, 0.2), (-0.2, 0), (0, -0.2)], "rotor_spin": [1, -1, 1, -1]}
+PLUS |= {"thrust_map": [8e-6, 0, 0], "yaw_torque_coefficient": 0.016, "inertia": [0.007, 0.008, 0.012]}
+REST = {"motor_time_constant": 0.03, "linear_drag": [0.1] * 3}
 TILTING = "<joint name='k' type='fixed'><parent>arm</parent><child>x::rotor_0</child></joint>"
 TILTING += "<joint name='tilt' type='revolute'><parent>base_link</parent><child>arm</child></joint>"
 HOVER, FAST = np.sqrt(9.81 * 2 / 4 / 1e-5), 2 * np.pi / 60  # of a rotor of the SDF [rad/s]; of one rpm
@@ -118,6 +129,8 @@ HOVER, FAST = np.sqrt(9.81 * 2 / 4 / 1e-5), 2 * np.pi / 60  # of a rotor of the 
      "mass", "inertia", "rotor_spin", "thrust_map", "linear_drag", "quadratic_drag")}),
     ("x.json", json.dumps({"dynamics": {**L2F, "rotor_thrust_coefficients": [0.1, 0.5, 5.0]}}),
      {"linear_drag": [0.1] * 3}, {"thrust_map": [5e-6, 5e-4, 0.1]}),
+    ("x.yaml", json.dumps(OMNI), REST, PLUS | {"rotor_speed_max": 838}),
+    ("x.yaml", json.dumps(ROTORS), REST | {"rotor_speed_max": 838}, PLUS | {"mass": 0.7}),
     ("x.toml", CRAZYFLOW, {}, {"linear_drag": [0.02, 0.02, 0.03], "motor_time_constant": [
      1 / (10 + 2e-4 * HOVER_RPM), 1 / (4e-4 * HOVER_RPM)]}),
 )  # fmt: skip

@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 Found = dict[str, tuple[Any, str]]  # of a field: its value, None where there is none, and a note
 RPM = math.pi / 30.0  # [rad/s]
 READABLE = (
-    "These can be read: URDF, SDF, YAML of Flightmare and Agilicious, TOML of drone-models and Crazyflow, JSON of "
-    "VisFly, of l2f (rl-tools) and of RotorPy's quad_params, and our own YAML and TOML."
+    "These can be read: URDF, SDF, YAML of Flightmare, Agilicious, RotorS and OmniDrones, TOML of drone-models and "
+    "Crazyflow, JSON of VisFly, of l2f (rl-tools) and of RotorPy's quad_params, and our own YAML and TOML."
 )
 AXES = ("xx", "yy", "zz", "xy", "xz", "yz")
 GIVEN = "given, not in the file"
@@ -274,9 +274,39 @@ def _rotorpy(said: Said) -> Found:
     return found
 
 
+def _by_angles(said: Said) -> Found:
+    """Of RotorS, which lists its rotors by number, and of OmniDrones, which lists their angles, and so on."""
+    names = {"angle": "rotor_angles", "arm_length": "arm_lengths", "direction": "directions"}
+    names |= {"rotor_force_constant": "force_constants", "rotor_moment_constant": "moment_constants"}
+    rotors, inertia = (said.data.get(x) for x in ("rotor_configuration", "inertia"))
+    said.asked |= {"rotor_configuration", "inertia"}
+    by_number = isinstance(rotors, Mapping) and all(isinstance(x, Mapping) for x in rotors.values())
+    if by_number:
+        each = [rotors[k] for k in sorted(rotors, key=lambda k: str(k).zfill(3))]
+        rotors = {theirs: [x.get(ours) for x in each] for ours, theirs in names.items()}
+    part = Said(rotors if isinstance(rotors, Mapping) else {}, f"{said.source}: rotor_configuration", {})
+    angle, arm, turn, force, torque = (part(name, None) for name in names.values())
+    found, fastest = said.fields(mass="mass"), part("max_rotation_velocities", None)
+    if isinstance(inertia, Mapping) and set(AXES) <= set(inertia):
+        found |= diagonal(symmetric(*(Said(inertia, f"{said.source}: inertia", {})(axes) for axes in AXES)))
+    if angle is not None and arm is not None:
+        found |= placed((arm * [np.cos(angle), np.sin(angle), 0.0 * angle]).T.round(9), note="arms at their angles")
+    if turn is not None:
+        found["rotor_spin"] = -turn, "against direction, which is 1 counter-clockwise"
+    if fastest is not None:
+        found["rotor_speed_max"] = same(fastest, "max_rotation_velocities")
+    if force is not None:
+        k2, why = same(force, "their force constants")
+        found["thrust_map"] = (None if k2 is None else [k2, 0.0, 0.0]), why
+        if torque is not None:  # of RotorS per force
+            found["yaw_torque_coefficient"] = same(torque / (1.0 if by_number else force), "their moment constants")
+    return found
+
+
 MAPPINGS: dict[str, tuple[Any, ...]] = {  # by kind: how it is read, and names that no other kind has
     "Flightmare, Agilicious or VisFly": (_flightmare, "tbm_fr", "arm_l", "motor_omega_max", "motor_tau"),
     "l2f": (_l2f, "rotor_thrust_coefficients", "rotor_torque_directions"),
     "drone-models": (_drone_models, "rpm2thrust", "mixing_matrix", "gravity_vec"),
     "RotorPy": (_rotorpy, "k_eta", "rotor_pos"),
+    "RotorS or OmniDrones": (_by_angles, "rotor_configuration"),
 }

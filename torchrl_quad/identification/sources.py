@@ -118,8 +118,10 @@ def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
         raise UnreadableLog(f"{name} is empty. Give a log that has samples.")
     mark = _mark(first)
     header = [part.strip().strip('"') for part in _split(first, mark)]
-    if not isinstance(columns, Mapping) and all(_number(x, mark) == _number(x, mark) for x in header):
-        raise UnreadableLog(f"{name}: its first row holds numbers. Put a row above it that names the columns.")
+    unnamed = UnreadableLog(f"{name}: its first row holds numbers. Put a row above it that names the columns.")
+    is_unnamed = all(_number(x, mark) == _number(x, mark) for x in header)
+    if is_unnamed and not isinstance(columns, Mapping):
+        raise unnamed
     if len(header) > MAX_COLUMNS:
         raise too_many(name, MAX_COLUMNS, "columns", "Leave some out.")
     samples = list(itertools.islice(rows, 2))
@@ -132,9 +134,13 @@ def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
     layout = match(header, name) if columns is None else choose(columns, _preset(header, name, columns))
     (clock,) = layout.time.names
     if clock not in header:
-        raise MissingColumns(
-            f"{name} has no column {clock} of the time. There are{listed(header, [clock, 'time', 'stamp'])}. "
-            'Name it: columns={"time": ...}.'
+        raise (
+            unnamed
+            if is_unnamed
+            else MissingColumns(
+                f"{name} has no column {clock} of the time. There are{listed(header, [clock, 'time', 'stamp'])}. "
+                'Name it: columns={"time": ...}.'
+            )
         )
     asked = layout.names | {clock}
     repeated = sorted(column for column, count in collections.Counter(header).items() if count > 1 and column in asked)

@@ -104,6 +104,8 @@ HOVER, FAST = np.sqrt(9.81 * 2 / 4 / 1e-5), 2 * np.pi / 60  # of a rotor of the 
     ("x.sdf", sdf(FRAME + motors()), {}, {"mass": 2.0, "inertia": [0.025, 0.065, 0.075],
      "rotor_positions": CORNERS, "rotor_spin": [-1, -1, 1, 1], "motor_time_constant": [0.0125, 0.025],
      "thrust_map": [1e-5, 0, 0], "linear_drag": [4e-4 * HOVER, 4e-4 * HOVER, 0]}),
+    ("x.sdf", sdf(FRAME.replace("<inertial><mass>0.25</mass></inertial>", "") + motors()), {}, {"mass": 1.0,
+     "rotor_positions": CORNERS, "inertia": [0.01, 0.02, 0.025]}),
     ("x.urdf", URDF.format("racer", 0), {"motor_time_constant": 0.05}, {
      "rotor_positions": [CORNERS[i] for i in (0, 3, 1, 2)],
      "rotor_spin": [1, -1, 1, -1], "thrust_map": [1e-9 / FAST**2, 0, 0], "yaw_torque_coefficient": 0.02,
@@ -152,6 +154,7 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_th
         for x in given
         if x != "entry"
     )
+    assert ("without a mass: rotor_0, " in written.read_text()) == ("rotor_0" in text and ">0.25<" not in text)
     assert HoveringEnv(num_envs=1, drone=str(written)).nominal.mass.item() == pytest.approx(drone.mass.item())
 
 
@@ -185,7 +188,7 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_th
         sdf(FRAME.replace("0.1 0 0 0<", "0.1 3.141592654 0 0<") + motors()),
         r"x.sdf: to hover, .*let rotor_direction point up",
     ),
-    ("x.urdf", URDF.format("cf", 0).replace("'prop", "'w"), "rotor_positions .* no link with an <inertial> is named"),
+    ("x.urdf", URDF.format("cf", 0).replace("'prop", "'w"), "rotor_positions .* no link is named"),
     (
         "x.json",
         json.dumps({**ROTORPY, "mass": None}),

@@ -242,7 +242,8 @@ def _drone_models(said: Said) -> Found:
             found[end] = speed_at(newton, curve), f"at {newton:g} N"
     mass = found["mass"][0]
     if (drag := said("drag_matrix", 3, 3)) is not None:
-        found.setdefault("linear_drag", (np.abs(np.diag(drag)), "drag_matrix"))
+        part = ", its diagonal alone" if np.count_nonzero(drag - np.diag(np.diag(drag))) else ""
+        found.setdefault("linear_drag", (np.abs(np.diag(drag)), f"drag_matrix{part}"))
     if curve is None or mass is None or mix is None:
         return found
     hover, lags = speed_at(9.81 * mass / mix.shape[1], curve) / RPM, said("rotor_dyn_coef", 4)

@@ -61,11 +61,13 @@ def read_xml(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
     short = {_last(name): name for name in links}
     rotors = [short.get(_last(x.findtext("linkName")), "") for x in motors]
     plain = {x: re.sub("(quad|hexa|octo|multi)_?rotor", "", x.lower()) for x in links}
-    for other, name, word in itertools.product(_OTHER, (_NUMBERED, _PLACED), ("rotor", "prop", "motor")):
-        named = [x for x, said in plain.items() if re.search(name.format(word), said) and not re.search(other, said)]
+    bodies = {x: said for x, said in plain.items() if not _is_bare(links[x])}  # others may be pictures of rotors
+    names = itertools.product((bodies, plain), _OTHER, (_NUMBERED, _PLACED), ("rotor", "prop", "motor"))
+    for known, other, name, word in names:
+        named = [x for x, said in known.items() if re.search(name.format(word), said) and not re.search(other, said)]
         rotors = rotors or sorted(named, key=_digits)
     if "" in rotors:
-        raise UserValueError(f"{path}: the linkName of a motor is that of no link with an <inertial>. Add it.")
+        raise UserValueError(f"{path}: the linkName of a motor is that of no link. Name its link.")
     lifts = [x for x in plugins if "liftdrag" in re.sub(r"\W|_", "", x.get("filename", "").lower())]
     blades = {*map(_last, rotors)}
     if any(_last(x.findtext("link_name")) not in blades for x in lifts):
@@ -161,9 +163,7 @@ def _add_urdf(root: ET.Element, links: Links, source: str) -> None:
     joints = {end(joint, "child"): joint for joint in root.iterfind("joint")}
     for link in root.iterfind("link"):
         name, frame = link.get("name", ""), np.eye(4)
-        if (inertial := link.find("inertial")) is None:
-            continue
-        above = name
+        inertial, above = next(link.iterfind("inertial"), ET.Element("inertial")), name
         for _ in range(DEPTH):  # up to the root; no further where they make a circle
             if above in joints:
                 frame, above = origin(joints[above]) @ frame, end(joints[above], "parent")
@@ -217,16 +217,16 @@ def _add_sdf(
         inside |= found if inner.get("merge") in ("true", "1") else {f"{name}::{k}": x for k, x in found.items()}
         inside[name] = place
     for link in model.iterfind("link"):
-        if (inertial := link.find("inertial")) is not None:
-            if inertial.get("auto") in ("true", "1"):
-                why = f"Gazebo computes the inertia of the link {shown(link.get('name'))} from its shapes"
-                raise UserValueError(f'{path}: {why}. Write its <mass> and <inertia>, without auto="true".')
-            name, frame = link.get("name", ""), standing(link)
-            said = map(inertial.findtext, ("mass", *(f"inertia/i{axes}" for axes in AXES)))
-            mass, inertia = _inertial(said, f"{path}: the link {shown(name)}")
-            if name in links:  # of another model
-                name = f"other{len(links)}::{name}"
-            links[name] = mass, frame @ own(inertial), inertia, frame[:3, [2, 2]].T
+        inertial = next(link.iterfind("inertial"), ET.Element("inertial"))
+        if inertial.get("auto") in ("true", "1"):
+            why = f"Gazebo computes the inertia of the link {shown(link.get('name'))} from its shapes"
+            raise UserValueError(f'{path}: {why}. Write its <mass> and <inertia>, without auto="true".')
+        name, frame = link.get("name", ""), standing(link)
+        said = map(inertial.findtext, ("mass", *(f"inertia/i{axes}" for axes in AXES)))
+        mass, inertia = _inertial(said, f"{path}: the link {shown(name)}")
+        if name in links:  # of another model
+            name = f"other{len(links)}::{name}"
+        links[name] = mass, frame @ own(inertial), inertia, frame[:3, [2, 2]].T
     return inside | {x: standing(names[x]) for x in names if names[x].tag in ("link", "frame")}
 
 
@@ -236,6 +236,11 @@ def _inertial(said: Iterable[str | None], link: str) -> tuple[float, Array]:
     if np.isnan(mass) and not np.isnan(moments[:3]).all():
         raise UserValueError(f"{link} has an inertia without a mass. Write it, or take the <inertial> out.")
     return np.nan_to_num(mass), symmetric(*moments)
+
+
+def _is_bare(link: tuple[float, Array, Array, Array]) -> bool:
+    """Whether a link says neither a mass nor an inertia."""
+    return link[0] == 0.0 and bool(np.isnan(link[2].diagonal()).all())
 
 
 def _included(path: Path, uri: str) -> tuple[Path, ET.Element]:
@@ -259,13 +264,15 @@ def _body(links: Links, rotors: Sequence[str], by_motors: bool) -> Found:
     for m, frame, inertia, _ in links.values():
         turn, arm = frame[:3, :3], frame[:3, 3] - centre
         whole += turn @ np.nan_to_num(inertia) @ turn.T + m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    note = "all links together" if sum(m > 0.0 for m, *_ in links.values()) > 1 else ""
-    found: Found = ({"mass": (mass, note)} if mass > 0.0 else {}) | diagonal(whole, note)
+    bare = [_last(x) for x, link in links.items() if _is_bare(link)]
+    parts = ["all links together"] if sum(m > 0.0 for m, *_ in links.values()) > 1 else []
+    note = "; ".join([*parts, f"without a mass: {one_line(', '.join(bare))}"] if bare else parts)
+    found: Found = ({"mass": (mass, note)} if mass > 0.0 else {}) | diagonal(whole, parts[0] if parts else "")
     points = [x for x, (m, _, inertia, _) in links.items() if np.isnan(inertia).any() and m > 0.2 * mass]
     if points:
         found["inertia"] = None, f"the link {shown(points[0])} has a mass, and no ixx, iyy and izz"
     if not rotors:
-        why = "relative to the centre of mass; no link with an <inertial> is named rotor, prop or motor with a number"
+        why = "relative to the centre of mass; no link is named rotor, prop or motor with a number"
         return found | {"rotor_positions": (None, why)}
     frames = np.array([links[x][1] for x in rotors]).round(12)
     up = np.array([links[x][3][0 if by_motors else 1] for x in rotors]).round(12)  # a motor pushes along the link's z

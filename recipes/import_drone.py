@@ -23,14 +23,16 @@ def main() -> None:
         print(__doc__)
         return
     path, cfg = settings(sys.argv[1:])
-    name = path.name.split(".")[0]
+    name = path.stem.removesuffix(".sdf")  # of .sdf.jinja
     name = cfg.get("entry") or (path.absolute().parent.name if name == "model" else name)  # many SDF are model.sdf
     output = Path(cfg.pop("output", None) or f"outputs/drones/{name}.yaml")
     if output.exists() and path.exists() and output.samefile(path):
         raise UserValueError(f"output={output} is the file that is read. Choose another.")
     if output.suffix not in (".yaml", ".yml"):
         raise UserValueError(f"output={output}: it is written in YAML, so its name must end in .yaml.")
-    text = import_drone(path, **cfg)
+    text, kept = import_drone(path, **cfg), output.read_text() if output.is_file() else None
+    if kept not in (None, text):
+        raise UserValueError(f"{output} exists, and says something else. Remove it, or write output=ANOTHER.yaml.")
     make_folder(output.parent)
     with replacing(output) as temporary:
         temporary.write_text(text)

@@ -96,7 +96,8 @@ PLUS = {"rotor_positions": [(0.2, 0), (0, 0.2), (-0.2, 0), (0, -0.2)], "rotor_sp
 PLUS |= {"thrust_map": [8e-6, 0, 0], "yaw_torque_coefficient": 0.016, "inertia": [0.007, 0.008, 0.012]}
 REST = {"motor_time_constant": 0.03, "linear_drag": [0.1] * 3}
 TILTING = "<joint name='k' type='fixed'><parent>arm</parent><child>x::rotor_0</child></joint>"
-TILTING += "<joint name='tilt' type='revolute'><parent>base_link</parent><child>arm</child></joint>"
+TILTING += "<joint name='tilt' type='revolute'><parent>base_link</parent><child>arm</child><axis><xyz>0 1 0</xyz>"
+TILTING += "<limit><effort>1</effort></limit></axis></joint>"
 HOVER, FAST = np.sqrt(9.81 * 2 / 4 / 1e-5), 2 * np.pi / 60  # of a rotor of the SDF [rad/s]; of one rpm
 
 
@@ -186,13 +187,23 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_th
     (
         "x.sdf",
         sdf(FRAME.replace("0.1 0 0 0<", "0.1 3.141592654 0 0<") + motors()),
-        r"x.sdf: to hover, .*let rotor_direction point up",
+        r"does not say rotor_direction .*: z of rotor_0 does not point up.*, rotor_direction=\[\[0,0,1\],",
     ),
     ("x.urdf", URDF.format("cf", 0).replace("'prop", "'w"), "rotor_positions .* no link is named"),
     (
         "x.json",
         json.dumps({**ROTORPY, "mass": None}),
         "mass .*, linear_drag .*: it follows from the drag of the rotors",
+    ),
+    ("x.sdf", sdf(FRAME + motors(rotorDragCoefficient=1)), "linear_drag .*: rotors differ in rotorDragCoefficient"),
+    ("x.sdf", sdf(FRAME.replace("base_link", "wheel_1")), "it has 'wheel_1', and a drone here has rotors alone"),
+    ("x.sdf", "<sdf><world><include/></world></sdf>", "a world that includes its models"),
+    ("x.sdf", sdf(FRAME + motors(linkName="gone")), "the linkName of a motor, 'gone', is that of no link"),
+    ("x.urdf", "<robot><link name='{{ name }}'/></robot>", "a template of Jinja"),
+    (
+        "x.json",
+        json.dumps(ROTORPY | {"k_eta": 1e-3}),
+        "would lift 49.* times the weight. rotor_speed_max",
     ),
     ("x.sdf", sdf("<include><uri>model://other</uri></include>"), "includes the model 'model://other': put it at "),
     ("x.urdf", "<!DOCTYPE x [<!ENTITY a 'b'>]><robot>&a;</robot>", "declares entities or a type"),
@@ -211,7 +222,7 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_th
     (
         "x.toml",
         "[cf2x]\nacc_coef = 1\nrpy_coef = [1.0]",
-        "a model fitted to attitude commands .* has no rotors. Give the params.toml of first",
+        "a model fitted to attitude commands .* has no rotors. Give the params.toml that has them",
     ),
     ("x.stl", "", "no drone can be read from a .stl file. These can be read"),
     ("x.yaml", "mass: 1", "has fields of our own format, which load_drone reads, and no others"),
@@ -339,10 +350,11 @@ def test_the_recipe_writes_a_drone_from_a_model_and_what_it_includes(tmp_path, m
     monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "x.sdf"), "mass=3", f"output={tmp_path}/o/x.yaml"])
     runpy.run_path(str(script), run_name="__main__")
     assert load_drone(tmp_path / "o/x.yaml").mass == 3.0 and f"env.drone={tmp_path}/o/x.yaml" in capsys.readouterr().out
-    monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "x.sdf"), "mass=3", "output=x.urdf"])
-    with pytest.raises(SystemExit):
-        runpy.run_path(str(script), run_name="__main__")
-    assert "its name must end in .yaml" in capsys.readouterr().err
+    for output, said in (("x.urdf", "its name must end in .yaml"), (f"{tmp_path}/o/x.yaml", "says something else")):
+        monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "x.sdf"), "mass=4", f"output={output}"])
+        with pytest.raises(SystemExit):
+            runpy.run_path(str(script), run_name="__main__")
+        assert said in capsys.readouterr().err
     monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "frame.sdf")])
     with pytest.raises(SystemExit):
         runpy.run_path(str(script), run_name="__main__")

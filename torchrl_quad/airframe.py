@@ -16,6 +16,7 @@ from torchrl_quad.errors import shown
 Array = NDArray[np.float64]
 AXES = np.array(["thrust", "roll", "pitch", "yaw"])
 NEARLY_LINEAR = 1e-3  # of a thrust map, k2 / k1 times the highest speed, below which single precision loses the speed
+MOST_LIFT = 100.0  # times the weight; rpm for rad/s make 90 times as much as is true
 INTEGRAL_SHARE = 0.1  # an integral as firmware has it: I is P times this share of the bandwidth without it
 
 JUDGED = ("mass", "inertia", "rotor_positions", "thrust_map", "rotor_speed_min", "rotor_speed_max")
@@ -26,7 +27,7 @@ def contradictions(fields: Mapping[str, ArrayLike]) -> Iterator[str]:
     drone = {name: np.asarray(fields[name], float) for name in JUDGED}
     inertia, k2, k1 = drone["inertia"], drone["thrust_map"][..., 0], drone["thrust_map"][..., 1]
     mass, low, high = (drone[x].reshape(-1) for x in ("mass", "rotor_speed_min", "rotor_speed_max"))
-    units = "Check the order of the axes and the unit: 1 g cm2 is 1e-7 kg m2"
+    units = "Check the order of the axes and the unit (1 g cm2 is 1e-7 kg m2), or give another inertia"
     if (twisted := 2.0 * inertia.max(-1) > inertia.sum(-1) * (1.0 + 1e-5)).any():
         worst = listed(inertia[twisted])
         yield f"inertia {worst} kg m2: in a body none of the three exceeds the sum of the others. {units}"
@@ -48,6 +49,12 @@ def contradictions(fields: Mapping[str, ArrayLike]) -> Iterator[str]:
         yield (
             "thrust_map must rise with rotor speed: k1 + 2 k2 w is "
             f"{listed(slow)} at rotor_speed_min and {listed(fast)} at rotor_speed_max"
+        )
+    lift = drone["rotor_positions"].shape[-2] * (k2 * high + k1) * high / (9.81 * mass)
+    if (lift > MOST_LIFT).any():
+        yield (
+            f"its rotors would lift {lift.max():.0f} times the weight. rotor_speed_max and thrust_map are in rad/s, of "
+            f"which 60 rpm are {2.0 * np.pi:.4g}, and mass is in kg"
         )
     least = NEARLY_LINEAR * abs(k1) / high
     if (abs(k2) < least).any():

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchrl_quad.airframe import uncontrolled
+from torchrl_quad.airframe import listed, uncontrolled
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.parameters import QuadrotorParams, RawParams
 from torchrl_quad.dynamics.rigid_body import Rotors, gyroscopic_torque, thrust_limits
@@ -180,7 +180,7 @@ def join(*parts: Tensor) -> Tensor:
 def _check_hover(nominal: QuadrotorParams, speed: Tensor, share: Tensor) -> None:
     if not (share > 0).all():
         raise UserValueError(
-            f"drone: to hover, its rotors would have to carry {shown(share.tolist())} of the weight each, and each "
+            f"drone: to hover, its rotors would have to carry {listed(share.tolist())} of the weight each, and each "
             "must carry a part. Put the centre of mass, x = y = 0, between the rotors of rotor_positions, and let "
             "rotor_direction point up; of four rotors neighbours spin opposite ways, rotor_spin."
         )

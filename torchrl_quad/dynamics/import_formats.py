@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_quad.airframe import listed
 from torchrl_quad.dynamics import presets
 from torchrl_quad.dynamics.parameters import FIELDS
 from torchrl_quad.errors import UserValueError, one_line, shown
@@ -119,7 +120,8 @@ def diagonal(matrix: Any, note: str = "") -> Found:
         return {
             "inertia": (
                 None,
-                f"its products of inertia are not small, {products:.2g} kg m2; give it about principal axes",
+                f"its products of inertia are not small, {products:.2g} kg m2, beside {listed(np.diag(matrix))}; give "
+                "it about principal axes",
             )
         }
     left = f"products of inertia up to {products:.2g} kg m2 left out" if products > 1e-6 * matrix.max() else ""

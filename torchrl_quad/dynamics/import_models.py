@@ -31,8 +31,9 @@ from torchrl_quad.errors import UserValueError, one_line, shown
 
 # What the name of a rotor's link says beside rotor, prop or motor, {0}: a number, or else where it is.
 _NUMBERED, _PLACED = r"{0}\D{{0,20}}\d", r"\d_?{0}|(left|right|front|rear|back).*{0}|{0}.*(left|right|front|rear|back)"
-_OTHER = "guard|arm|mount|adapter|hub|base", "guard"  # what a rotor is not called; the second where all are
+_OTHER = "guard|arm|mount|adapter|hub|base|shaft", "guard"  # what a rotor is not called; the second where all are
 _TURNING = ("revolute", "continuous", "prismatic", "universal", "ball", "screw")  # joints
+_GROUND = "wheel|wing|aileron|elevon|elevator|rudder"  # what links of other vehicles are called
 DEPTH = 20  # of models, joints and frames within each other
 # Of each link: its mass, the frame of its centre of mass, its inertia there (NaN where nothing is said), and two
 # directions: of its z axis, and of the axis that it turns about.
@@ -49,9 +50,9 @@ def read_xml(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
     elif models:
         drone = max(models, key=lambda model: len([*model.iter("plugin"), *model.iter("include")]))  # not the ground
         _add_sdf(drone, np.eye(4), path, links, plugins)
-        if not links and root.find("world/include") is not None:
-            raise UserValueError(f"{path}: a world that includes its models. Give the file of the drone's own model.")
-    else:
+    if root.find("world/include") is not None and not plugins:  # its own model is the ground
+        raise UserValueError(f"{path}: a world that includes its models. Give the file of the drone's own model.")
+    if drone is root and root.tag not in ("robot", "model"):
         raise UserValueError(
             f"{path}: XML with the root <{one_line(root.tag)}> is no URDF or SDF with a model. {READABLE}"
         )
@@ -59,7 +60,8 @@ def read_xml(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
         (x for x in plugins if x.find("motorConstant") is not None), key=lambda x: _digits(x.findtext("motorNumber"))
     )
     short = {_last(name): name for name in links}
-    rotors = [short.get(_last(x.findtext("linkName")), "") for x in motors]
+    said = [(x.findtext("linkName") or "").strip() for x in motors]
+    rotors = [x if x in links else short.get(_last(x), "") for x in said]
     plain = {x: re.sub("(quad|hexa|octo|multi)_?rotor", "", x.lower()) for x in links}
     bodies = {x: said for x, said in plain.items() if not _is_bare(links[x])}  # others may be pictures of rotors
     names = itertools.product((bodies, plain), _OTHER, (_NUMBERED, _PLACED), ("rotor", "prop", "motor"))
@@ -67,39 +69,67 @@ def read_xml(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
         named = [x for x, said in known.items() if re.search(name.format(word), said) and not re.search(other, said)]
         rotors = rotors or sorted(named, key=_digits)
     if "" in rotors:
-        raise UserValueError(f"{path}: the linkName of a motor is that of no link. Name its link.")
+        which = shown(said[rotors.index("")])
+        raise UserValueError(f"{path}: the linkName of a motor, {which}, is that of no link. Name its link.")
+    if others := [x for x in links if re.search(_GROUND, _last(x).lower()) and x not in rotors]:
+        raise UserValueError(f"{path}: it has {shown(_last(others[0]))}, and a drone here has rotors alone.")
     lifts = [x for x in plugins if "liftdrag" in re.sub(r"\W|_", "", x.get("filename", "").lower())]
     blades = {*map(_last, rotors)}
     if any(_last(x.findtext("link_name")) not in blades for x in lifts):
         raise UserValueError(f"{path}: it has wings (LiftDrag), and a drone here has rotors alone. Take a multicopter.")
-    _check_fixed(drone, blades, path)
-    found = _body(links, rotors, bool(motors)) | given
+    held = _check_fixed(drone, [_last(x) for x in rotors], path)
+    found = _body(links, rotors, bool(motors), held) | given
     _add_motors(found, motors, str(path), given)
+    dropped = ("velocity_decay/linear", "velocity_decay/angular", "rollingMomentCoefficient")
+    unread = [x for x in dropped if any(_numbers(y.text, 1, str(path)).any() for y in root.iterfind(f".//{x}"))]
     if (said := root.find("properties")) is not None and root.tag == "robot":
         values = {name: presets.parse(text.encode(), name) for name, text in said.attrib.items()}
         numbers = Said(values, str(path), given)
         _add_attributes(found, numbers, root.get("name", ""))
         return str(path), "URDF of gym-pybullet-drones", found, [x for x in said.attrib if x not in numbers.asked]
-    return str(path), "URDF" if root.tag == "robot" else "SDF", found, []
+    return str(path), "URDF" if root.tag == "robot" else "SDF", found, unread
 
 
-def _check_fixed(drone: ET.Element, rotors: set[str], path: Path) -> None:
-    """Refuse rotors that a joint turns against the body."""
+def _check_fixed(drone: ET.Element, rotors: Sequence[str], path: Path) -> list[str]:
+    """Refuse rotors that a joint turns against the body; the joints of other parts that move, which are read as fixed.
+
+    A rotor spins by the first joint above it that turns about z. What is above all rotors moves the whole drone.
+    """
     joints = {}
     for joint in drone.iter("joint"):
         ends = [joint.find(name) for name in ("parent", "child")]
         parent, child = ("" if x is None else _last(x.get("link") or x.text) for x in ends)
         if parent and child:
             joints[child] = parent, joint
-    for rotor in rotors:
-        link = joints.get(rotor, ("",))[0]  # by a joint of its own, which spins it
-        for _ in range(DEPTH):
-            link, joint = joints.get(link, ("", None))
-            ends = [] if joint is None else [*joint.iter("limit")]
-            limits = {x.get(k) or x.findtext(k) for x in ends for k in ("lower", "upper")}
-            if joint is not None and joint.get("type") in _TURNING and len(limits) != 1:
-                why = f"the joint {shown(joint.get('name'))} turns the rotor {shown(rotor)}"
+
+    def above(link: str) -> list[str]:
+        chain = [link]
+        while chain[-1] in joints and len(chain) <= DEPTH:
+            chain.append(joints[chain[-1]][0])
+        return chain
+
+    chains = [above(rotor) for rotor in rotors]
+    shared = set(chains[0]).intersection(*chains[1:]) if len(chains) > 1 else set[str]()
+    for chain in chains:
+        spins = False
+        for link in [x for x in chain if x not in shared and x in joints and _moves(joints[x][1])]:
+            joint = joints[link][1]
+            axis = _numbers(
+                next((x.get("xyz") or x.findtext("xyz") for x in joint.iter("axis")), "0 0 1"), 3, str(path)
+            )
+            if spins or (link != chain[0] and abs(axis[2]) < 0.7 * np.linalg.norm(axis)):
+                why = f"the joint {shown(joint.get('name'))} turns the rotor {shown(chain[0])}"
                 raise UserValueError(f"{path}: {why}, and rotors here are fixed to the body. Take another drone.")
+            spins = True
+    free = {link for link in joints if _moves(joints[link][1])} - {x for chain in chains for x in chain} - shared
+    return [joints[link][1].get("name", link) for link in joints if link in free]
+
+
+def _moves(joint: ET.Element) -> bool:
+    """Whether a joint lets its link move: its type does, and no equal limits lock it."""
+    ends = [x.get(k) or x.findtext(k) for x in joint.iter("limit") for k in ("lower", "upper")]
+    locked = len(ends) == 2 and None not in ends and float(ends[0] or 0.0) == float(ends[1] or 0.0)
+    return joint.get("type") in _TURNING and not locked
 
 
 def _last(name: str | None) -> str:
@@ -114,7 +144,7 @@ def _digits(name: str | None) -> list[int]:
 def _xml(path: Path) -> ET.Element:
     text = read_text(path)
     text = re.sub(r"{#.*?#}", "", text[max(text.find("<?xml"), 0) :], flags=re.DOTALL)  # comments of Jinja, of Gazebo
-    if chosen := re.search(r"{%-?\s*(if|for|macro|include|block)\b.*", text):
+    if chosen := re.search(r"{%-?\s*\w.*|{{.*", text):
         raise UserValueError(f"{path}: a template of Jinja, with {shown(chosen[0][:40])}. Render it first.")
     if re.match(r"\s*<(!doctype )?html", text.lower()):
         raise UserValueError(f"{path}: this is a web page. Download the file itself, which GitHub calls raw.")
@@ -129,6 +159,8 @@ def _xml(path: Path) -> ET.Element:
         raise UserValueError(f"{path}: not an XML file: {one_line(error)}.") from None
     if any("xacro" in x.tag or "${" in "".join(x.attrib.values()) for x in root.iter()):
         raise expand
+    for x in root.iter():
+        x.tag = x.tag.rpartition("}")[2]  # without its namespace
     return root
 
 
@@ -210,6 +242,7 @@ def _add_sdf(
         if inner.find("placement_frame") is not None:
             raise UserValueError(f"{path}: a placement_frame is not read. Write the pose of the model's own frame.")
         if inner.tag == "include":
+            plugins += inner.iterfind("plugin")
             file, said = _included(path, inner.findtext("uri", ""))
             place = place if inner.find("pose") is not None else place @ own(said)
         found = _add_sdf(said, place, file, links, plugins, depth + 1)
@@ -256,7 +289,7 @@ def _included(path: Path, uri: str) -> tuple[Path, ET.Element]:
     return file, inner
 
 
-def _body(links: Links, rotors: Sequence[str], by_motors: bool) -> Found:
+def _body(links: Links, rotors: Sequence[str], by_motors: bool, held: Sequence[str]) -> Found:
     """All links as one rigid body, and where its rotors are from the centre of mass."""
     mass = sum(m for m, *_ in links.values())
     centre = sum((m * frame[:3, 3] for m, frame, *_ in links.values()), np.zeros(3)) / max(mass, 1e-9)
@@ -266,16 +299,23 @@ def _body(links: Links, rotors: Sequence[str], by_motors: bool) -> Found:
         whole += turn @ np.nan_to_num(inertia) @ turn.T + m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     bare = [_last(x) for x, link in links.items() if _is_bare(link)]
     parts = ["all links together"] if sum(m > 0.0 for m, *_ in links.values()) > 1 else []
+    parts += [f"as if these joints were fixed: {one_line(', '.join(held))}"] if held else []
     note = "; ".join([*parts, f"without a mass: {one_line(', '.join(bare))}"] if bare else parts)
-    found: Found = ({"mass": (mass, note)} if mass > 0.0 else {}) | diagonal(whole, parts[0] if parts else "")
+    found: Found = ({"mass": (mass, note)} if mass > 0.0 else {}) | diagonal(whole, "; ".join(parts))
     points = [x for x, (m, _, inertia, _) in links.items() if np.isnan(inertia).any() and m > 0.2 * mass]
     if points:
         found["inertia"] = None, f"the link {shown(points[0])} has a mass, and no ixx, iyy and izz"
     if not rotors:
         why = "relative to the centre of mass; no link is named rotor, prop or motor with a number"
         return found | {"rotor_positions": (None, why)}
+    places = [links[x][1][:3, 3] for x in rotors]
+    same_place = [any(np.linalg.norm(x - y) < 1e-3 for y in places[:k]) for k, x in enumerate(places)]
+    rotors = [x for x, again in zip(rotors, same_place, strict=True) if by_motors or not again]
     frames = np.array([links[x][1] for x in rotors]).round(12)
     up = np.array([links[x][3][0 if by_motors else 1] for x in rotors]).round(12)  # a motor pushes along the link's z
+    if np.all(up[:, 2] < 0.3):  # as where a mesh was exported lying
+        found["rotor_direction"] = None, f"z of {rotors[0]} does not point up: give a direction for each rotor"
+        return found | {"rotor_positions": ((frames[:, :3, 3] - centre).round(12), f"of {', '.join(rotors)}")}
     return found | placed((frames[:, :3, 3] - centre).round(12), up, note=f"of {', '.join(rotors)}")
 
 
@@ -297,7 +337,10 @@ def _add_motors(found: Found, motors: Sequence[ET.Element], source: str, given: 
     found["motor_time_constant"], (k2, why) = said("timeConstantUp", "timeConstantDown"), said("motorConstant")
     found["thrust_map"] = (None if k2 is None else [k2, 0.0, 0.0]), why
     found |= given
-    add_drag(found, said("rotorDragCoefficient")[0], None)
+    drag, why = said("rotorDragCoefficient")
+    add_drag(found, drag, None)
+    if why:
+        found["linear_drag"] = None, why
 
 
 def _add_attributes(found: Found, said: Said, name: str) -> None:

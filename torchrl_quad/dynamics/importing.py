@@ -22,6 +22,7 @@ from torchrl_quad.dynamics.import_formats import (
     Found,
     Said,
     read_json,
+    read_text,
     speed_at,
     usable,
 )
@@ -90,6 +91,10 @@ def import_drone(path: str | Path, *, entry: str | None = None, **fields: Any) -
         ValueError: it cannot be read, or lacks fields that are not given; all of them are named.
         FileNotFoundError: the path does not exist.
     """
+    if not Path(path).is_file():  # a preset is no file
+        read_text(Path(path))
+    if unknown := [x for x in fields if x not in FIELDS]:
+        raise UserValueError(f"{shown(unknown[0])} is no field of a drone. Choose from: {', '.join(FIELDS)}.")
     source, kind, found, unread = _read(Path(path), entry, fields)
     if not kind:
         raise UserValueError(
@@ -119,6 +124,9 @@ def _completed(
     """What a file and a user say, and what is ours; an error names all that is missing."""
     if "rotor_positions" in fields and "rotor_direction" not in fields:
         found = {k: x for k, x in found.items() if k != "rotor_direction"}  # of the file's places
+    curve, slowest = (found.get(x, (None,))[0] for x in ("thrust_map", "rotor_speed_min"))
+    if curve is not None and slowest is not None and curve[1] + 2.0 * curve[0] * slowest < 0.0:
+        found = found | {"rotor_speed_min": (None, f"thrust falls with speed up to {-0.5 * curve[1] / curve[0]:.4g}")}
     known, found = found | usable(fields), found | {k: (v, GIVEN) for k, v in fields.items()}
     examples = _examples(known)
     if missing := [x for x in examples if found.get(x, (None,))[0] is None]:
@@ -176,6 +184,10 @@ def _examples(found: Found) -> dict[str, str]:
     if curve is not None and curve[1] < 0.0 < curve[0]:  # thrust falls at first, so that rotors must not stand
         examples["rotor_speed_min"] = f"{-0.55 * curve[1] / curve[0]:.3g}"  # a tenth beyond the lowest thrust
     examples["linear_drag"] = str([float(f"{0.3 * heavy:.2g}")] * 3)
+    arm = 0.14 if places is None else np.linalg.norm(np.asarray(places, float)[:, :2], axis=1).max()
+    examples["inertia"] = str([float(f"{share * heavy * arm**2:.2g}") for share in (0.3, 0.3, 0.5)])
+    if "rotor_direction" in found and found["rotor_direction"][0] is None:
+        examples["rotor_direction"] = str([[0, 0, 1]] * n)
     return {name: example.replace(" ", "") for name, example in examples.items()}  # one word of a command line
 
 
@@ -187,6 +199,8 @@ def _read(drone: Any, entry: str | None, fields: Mapping[str, Any]) -> tuple[str
             f"{drone}: a {suffix} file has to be run before its numbers can be read. {CONVERT[suffix]}"
         )
     if suffix in (".urdf", ".sdf", ".world", ".xml", ".jinja"):
+        if entry is not None:
+            raise UserValueError(f"{drone}: has no drones by name. Leave out entry={shown(entry)}.")
         return read_xml(Path(drone), usable(fields))
     if suffix == ".json":
         source, data = str(drone), read_json(Path(drone))
@@ -211,7 +225,7 @@ def _read(drone: Any, entry: str | None, fields: Mapping[str, Any]) -> tuple[str
     if any(isinstance(part, Mapping) and "rpy_coef" in part for part in parts):
         raise UserValueError(
             f"{source}: a model fitted to attitude commands (so_rpy of drone-models) has no rotors. Give the "
-            "params.toml of first_principles beside it."
+            "params.toml that has them, with mass and rpm2thrust."
         )
     if not drones and not isinstance(drone, Mapping) and not (own and 2 * len(own) > len(data)):
         raise UserValueError(f"{source}: this file is of no kind that is known. {READABLE}")

@@ -237,5 +237,6 @@ def _checked(name: str, value: Any, like: Tensor, source: str, places: Any) -> T
     if name == "rotor_direction" and not (numbers.norm(dim=-1) > 1e-3).all():
         fits, rule = numbers.norm(dim=-1) > 1e-3, "a direction for each rotor, such as [0, 0, 1] for up"
     if not fits.all():
+        rule += "; of a matrix give the diagonal" if name == "inertia" and value.shape[-2:] == (3, 3) else ""
         raise UserValueError(f"{source}: field {name!r} must be {rule}, in SI units; got {shown(value.tolist())}.")
     return value

@@ -40,7 +40,9 @@ def read(kind: str, preset: str | Path | Mapping, folder: Traversable | None = N
     choices = f"Choose from: {', '.join(known)}; or give" if known else "Give"
     if isinstance(preset, str) and preset in known:
         source, path = f"{preset}.yaml", known[preset]
-    elif isinstance(preset, Path) or (isinstance(preset, str) and preset.lower().endswith((".yaml", ".yml", ".toml"))):
+    elif isinstance(preset, Path) or (
+        isinstance(preset, str) and preset.lower().endswith((".yaml", ".yml", ".toml", ".json"))
+    ):
         source, path = str(preset), Path(preset)
     elif isinstance(preset, str) and os.path.isfile(preset):
         raise UserValueError(

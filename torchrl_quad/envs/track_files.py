@@ -150,7 +150,6 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
     notes = [
         f"gates are flown along their {axis} axis",
         f"they are open {shown(own['width'])} x {shown(own['height'])} m, with frames of {shown(own['frame'])} m",
-        "poles are 0.03 m thick, and end at their position",
         "the drone hovers above its start; drone, sensors and disturbances are not read",
     ]
     notes += [f"{len(drones)} drones race there: the first is read"] if len(drones) > 1 else []
@@ -178,12 +177,13 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
         roll, pitch, yaw = drawn["gate_rpy"][1].tolist()
         own["rotation_jitter"] = [roll, pitch, yaw] if axis == "x" else [pitch, roll, yaw]
     own["starts"] = [[*start[:2], max(start[2], box[0][2] + 0.25)], *before[1:]]
+    notes.append("poles are 0.03 m thick, and end at their position")
     tops = as_array([pole["pos"] for pole in track.get("obstacles", [])]).reshape(-1, 3)
     middle, spread = drawn.get("obstacle_pos", (np.zeros(3), np.zeros(3)))
     low, high = (np.c_[tops[:, :2] + middle[:2] + sign * spread[:2], 0.0 * tops[:, 2]].tolist() for sign in (-1, 1))
     poles = [{"radius": LSY_POLE, "height": z} for z in tops[:, 2].tolist()]
     for pole, z, least, most in zip(poles, tops[:, 2] + middle[2], low, high, strict=True):
-        ends = {"count": 1, "low": least, "high": most, "height": [z - spread[2], z + spread[2]]}
+        ends = {"count": 1, "low": least, "high": most, "height": [float(z - spread[2]), float(z + spread[2])]}
         pole |= ends if spread.any() else {"base": least}
     return {**own, "scene": {"cylinders": poles}} if poles else own
 

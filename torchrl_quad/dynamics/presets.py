@@ -20,6 +20,7 @@ from torchrl_quad.errors import UserValueError, shown
 MAX_BYTES = 1_000_000  # of a file; the largest that ships with the package has 1 kB
 MAX_DEPTH = 20  # of lists and mappings within each other
 MAX_DIGITS = 400  # of a number
+_ENDINGS = (".yaml", ".yml", ".toml", ".json")  # JSON is YAML, too
 
 
 def names(folder: Traversable) -> list[str]:
@@ -40,9 +41,7 @@ def read(kind: str, preset: str | Path | Mapping, folder: Traversable | None = N
     choices = f"Choose from: {', '.join(known)}; or give" if known else "Give"
     if isinstance(preset, str) and preset in known:
         source, path = f"{preset}.yaml", known[preset]
-    elif isinstance(preset, Path) or (
-        isinstance(preset, str) and preset.lower().endswith((".yaml", ".yml", ".toml", ".json"))
-    ):
+    elif isinstance(preset, Path) or (isinstance(preset, str) and preset.lower().endswith(_ENDINGS)):
         source, path = str(preset), Path(preset)
     elif isinstance(preset, str) and os.path.isfile(preset):
         raise UserValueError(

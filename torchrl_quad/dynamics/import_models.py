@@ -33,7 +33,7 @@ from torchrl_quad.errors import UserValueError, one_line, shown
 _NUMBERED, _PLACED = r"{0}\D{{0,20}}\d", r"\d_?{0}|(left|right|front|rear|back).*{0}|{0}.*(left|right|front|rear|back)"
 _OTHER = "guard|arm|mount|adapter|hub|base|shaft", "guard"  # what a rotor is not called; the second where all are
 _TURNING = ("revolute", "continuous", "prismatic", "universal", "ball", "screw")  # joints
-_GROUND = "wheel|wing|aileron|elevon|elevator|rudder"  # what links of other vehicles are called
+_GROUND = "wheel|(?<!s)wing|aileron|elevon|elevator|rudder"  # what links of other vehicles are called
 DEPTH = 20  # of models, joints and frames within each other
 # Of each link: its mass, the frame of its centre of mass, its inertia there (NaN where nothing is said), and two
 # directions: of its z axis, and of the axis that it turns about.
@@ -127,9 +127,10 @@ def _check_fixed(drone: ET.Element, rotors: Sequence[str], path: Path) -> list[s
 
 def _moves(joint: ET.Element) -> bool:
     """Whether a joint lets its link move: its type does, and no equal limits lock it."""
-    ends = [x.get(k) or x.findtext(k) for x in joint.iter("limit") for k in ("lower", "upper")]
-    locked = len(ends) == 2 and None not in ends and float(ends[0] or 0.0) == float(ends[1] or 0.0)
-    return joint.get("type") in _TURNING and not locked
+    limit = next(joint.iter("limit"), joint)
+    ends = [limit.get(k) or limit.findtext(k) for k in ("lower", "upper")]
+    low, high = (_numbers(x, 1, f"the limits of the joint {shown(joint.get('name'))}", np.nan)[0] for x in ends)
+    return joint.get("type") in _TURNING and not low == high
 
 
 def _last(name: str | None) -> str:

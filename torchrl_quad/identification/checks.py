@@ -226,7 +226,7 @@ def check_rates(
 
 def _clock(factor: float) -> Remedy:
     """For what is ``factor`` times its derivative by a clock."""
-    return {"quantity": "time", "factor": float(f"{1.0 / factor:.2g}"), "when": "the clock is no clock of seconds"}
+    return {"quantity": "time", "factor": float(f"{1.0 / factor:.2g}"), "when": "time does not count seconds"}
 
 
 def _turn(gyro: Array, right: Array, dt: float, moving: Mask) -> tuple[Array, str]:

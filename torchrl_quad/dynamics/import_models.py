@@ -130,7 +130,7 @@ def _moves(joint: ET.Element) -> bool:
     limit = next(joint.iter("limit"), joint)
     ends = [limit.get(k) or limit.findtext(k) for k in ("lower", "upper")]
     low, high = (_numbers(x, 1, f"the limits of the joint {shown(joint.get('name'))}", np.nan)[0] for x in ends)
-    return joint.get("type") in _TURNING and not low == high
+    return joint.get("type") in _TURNING and low != high
 
 
 def _last(name: str | None) -> str:

@@ -8,6 +8,7 @@ ours), ``name`` (as which quantity), ``drop``; ``when`` says on what it depends.
 from __future__ import annotations
 
 import collections
+import time
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -18,7 +19,7 @@ from torchrl_quad.deploy.frames import Convention
 from torchrl_quad.identification.errors import LogError, Remedy
 from torchrl_quad.identification.layouts import RIVALS, Columns, Layout
 
-_DEEPEST, _MOST = 4, 30  # faults of one log that are mended together, and how often it is read for that
+_DEEPEST, _MOST, _SECONDS = 4, 30, 60.0  # faults of one log that are mended together; how often it is read, how long
 
 
 @dataclass(frozen=True)
@@ -83,11 +84,11 @@ class Mended:
 
 def remedy_for(error: LogError, start: Mended, read: Callable[[Mended], object]) -> Mended | None:
     """The fewest remedies with which the log reads: one alone, else with those of the errors that come next."""
-    queue, reads = collections.deque([(error, start, 1)]), 0
+    queue, reads, begun = collections.deque([(error, start, 1)]), 0, time.monotonic()
     while queue:
         error, before, depth = queue.popleft()
         for mended in filter(None, map(before.by, error.remedies)):
-            if reads == _MOST:
+            if reads == _MOST or time.monotonic() - begun > _SECONDS:
                 return None
             reads += 1
             try:

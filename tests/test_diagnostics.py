@@ -121,7 +121,7 @@ def fly(task, horizon=24, **options):
     ("landing", {}, ["success", "crash"], []),
     ("racing", {"reward": "position"}, ["gate"], ["'attitude'"]),
     ("racing", {"reward": "velocity"}, ["gate"], []),
-    ("racing", {"gate_bonus": "log"}, [], ["gate,", "a"]),  # it falls at each gate, and steps pay less than nothing
+    ("racing", {"gate_bonus": "log"}, [], ["gate,", "as"]),  # it falls at each gate, and steps pay less than nothing
     ("racing", {"reward": "velocity", "gate_bonus": "reciprocal"}, [], ["gate,"]),
 )
 def test_the_audit_finds_which_rewards_are_fully_and_which_are_partially_differentiable(task, options, without, traps):
@@ -164,6 +164,16 @@ class CrashedEnv(HoveringEnv):
         return torch.ones_like(state["step"], dtype=torch.bool)
 
 
+class SparseEnv(HoveringEnv):
+    """Paid for arriving alone; two of six starts crash at once."""
+
+    def is_crash(self, state):
+        return (torch.arange(self.num_envs)[:, None] % 5 == 0) & (state["step"] < 2)
+
+    def reward_terms(self, state):
+        return {"arrival": self.is_success(state).to(self.dtype)}
+
+
 class EasyEnv(HoveringEnv):
     """Every state is a success, and the observation has a large constant."""
 
@@ -185,15 +195,26 @@ def test_a_success_that_is_always_true_and_a_large_observation_are_traps_and_a_c
     )
 
 
+def test_a_reward_without_any_gradient_and_starts_that_crash_at_once_are_traps():
+    audit = audit_reward(*fly(SparseEnv, 12))
+    assert audit["arrival"].verdict in ("no gradient", "not seen") and audit["arrival"].gradient_norm == 0.0
+    first, *_, last = audit.traps
+    assert re.match("[0-9]+% of the episodes end in their first step", first) and "no term has a gradient" in last
+
+
 NO_ATTITUDE = {"attitude": 0.0}
 
 
 @cases(
-    ("racing", {"gate": 0.0, **NO_ATTITUDE}, "gate, target.* waiting before an arrival pays more than arriving"),
+    ("racing", {"gate": 0.0, **NO_ATTITUDE}, "gate, target.* if a drone that waits .* waiting pays more than arriving"),
     (DoubtfulEnv, {"arrival": 1.0}, "success ends an episode and pays 1.1, .*: loitering pays more"),
     (DoubtfulEnv, {"near": 10.0, "width": 0.08}, "'near' is flat in .* of the flights, those in which it pays least"),
-    (HoveringEnv, {"survival": 0.0, **NO_ATTITUDE}, "a step pays -0.0.* a crash was not seen: dying is cheap"),
-    (CrashedEnv, {}, "all episodes end in their first step: look at the start, is_crash and is_success"),
+    (
+        HoveringEnv,
+        {"survival": 0.0, **NO_ATTITUDE},
+        "as this policy flies .* must cost more than [0-9.]*, else dying is",
+    ),
+    (CrashedEnv, {}, "100% of the episodes end in their first step: look at the start, is_crash and is_success"),
     (HoveringEnv, {}, "'attitude' is less than a thousandth of return and gradient"),
 )
 def test_the_audit_says_in_words_what_keeps_a_policy_from_learning_a_task(task, weights, trap):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from refusals import cases, refuses
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictParams
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.envs import MultiAction, StepCounter, TransformedEnv
@@ -13,6 +13,8 @@ from torchrl_quad import HoveringEnv, HybridLoss, LandingEnv, SHACLoss, load_dro
 from torchrl_quad.data import differentiable_rollout, restart
 from torchrl_quad.envs import Event
 from torchrl_quad.modules import make_actor, make_value
+from torchrl_quad.objectives.calls import holding
+from torchrl_quad.training.launch import Refused, _explained
 
 nan = float("nan")
 visfly = load_drone("visfly")
@@ -87,6 +89,11 @@ def test_a_bad_value_is_refused_by_name(kwargs, message):
         lambda _, s: s["vel"] > 0.0,
         "is_crash asks for 'vel', which is no entry of the state .* has: position",
     ),
+    (
+        "reward_terms",
+        lambda _, s: {"on": 0.1},
+        r"got float. Write torch.full_like\(state\['position'\]\[:, :1\], 0.1\)",
+    ),
     ("metrics", lambda _, s: {"far": s["step"]}, r"\['far'\] must be a tensor \(4, 1\), torch.float32; got"),
     ("reward_terms", lambda _, s: -s["position"], r"reward_terms\(state\) must be a mapping .*; got Tensor"),
     ("advance", lambda _, p, s: None, r"advance\(previous, state\) must be a mapping .*; got NoneType"),
@@ -101,11 +108,29 @@ def test_a_bad_value_is_refused_by_name(kwargs, message):
     ("events", lambda _, p, s: {"near": near(s, term="gate")}, "term must be one of survival, .*; got 'gate'"),
     ("initial_state", adding(legs=torch.zeros(4)), r"'legs' must be a tensor \(4, ...\) of at least two .*\(4,\)"),
     ("initial_state", adding(step=torch.zeros(4, 1)), "entry 'step' is the environment's own; give yours another"),
+    (
+        "initial_state",
+        lambda env, n: {**HoveringEnv.initial_state(env, n), "legs": torch.rand(n, 1)},
+        "initial_state: 'legs' ignores the seed. Draw from self.uniform",
+    ),
     ("initial_state", adding(legs=torch.zeros(4, 1).int()), r"'legs' must be .* int64 or bool; got .* torch.int32\)"),
 )
 def test_a_task_of_another_form_is_refused_by_the_name_of_its_method(method, wrong, message):
     with pytest.raises(ValueError, match="OwnEnv." + (message if message.startswith(method) else ".*" + message)):
         type("OwnEnv", (HoveringEnv,), {method: wrong})(num_envs=4)
+
+
+def test_a_branch_on_data_is_named_by_its_line_and_a_stopped_program_gives_parameters_back():
+    branching = torch.compile(lambda x: x if (x > 0.0).all() else -x, fullgraph=True, backend="eager")
+    said = r"test_errors.py:\d+: the compiler cannot follow this line: .*torch.where"
+    with pytest.raises(Refused, match=said), _explained():
+        branching(torch.ones(2))
+    module = torch.nn.Linear(1, 1)
+    mine, others = module.weight, TensorDictParams(TensorDict.from_module(module).data.clone())
+    for stop in (KeyboardInterrupt(), ValueError()):
+        with pytest.raises(type(stop)), holding(others, module):
+            raise stop
+        assert module.weight is mine
 
 
 def test_an_event_whose_term_has_a_name_that_is_taken_is_refused():

@@ -15,6 +15,7 @@ from tensordict import TensorDict
 from torchrl_quad import make_env
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs import TASKS
+from torchrl_quad.envs.terms import axes_observation
 
 N = 3
 DRONE = "position", "quaternion", "velocity", "angular_velocity", "rotor_speed"
@@ -170,6 +171,10 @@ def test_two_quaternions_of_one_attitude_fly_alike(task, flight):
     for key in ("reward", "crash", "success", ("state", "position"), ("state", "velocity"), ("state", "rotor_speed")):
         torch.testing.assert_close(one[key], two[key], rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(one["state", "quaternion"], -two["state", "quaternion"], rtol=1e-12, atol=1e-12)
+    seen, again = (axes_observation(dict(x["state"].items()))[0] for x in (one, two))
+    torch.testing.assert_close(seen, again, rtol=1e-11, atol=1e-11)
+    up = quaternion.rotate(one["state", "quaternion"], torch.tensor([0.0, 0.0, 10.0]).to(seen).expand(N, 3))
+    torch.testing.assert_close(seen[:, 3:], up)
 
 
 @each_task

@@ -21,6 +21,9 @@ from torchrl_quad.objectives.calls import discounts, sources_of_steps, total
 from torchrl_quad.objectives.pathwise import PathwiseLoss
 from torchrl_quad.options import Entry, Fraction, Horizon, NonNegative, Size, checked, entries
 
+# Entries of the state that jump for other reasons than a task's.
+_OF_THE_ENVIRONMENT = {"position", "velocity", "quaternion", "angular_velocity", "rotor_speed", "action_queue", "step"}
+_OF_THE_ENVIRONMENT |= {"collided", "drone", "scene", "wind", "traits", "delay"}
 Inputs = nn.Module | Tensor | Iterable[Tensor]
 
 
@@ -154,13 +157,14 @@ def audit_reward(
             f"{gap.max().item():.3g}. Either a term is missing or not weighted, or a transform has changed the reward: "
             "name the one before it, reward_key=..."
         )
-    if not reward.requires_grad:
+    steps = _steps(rollout.get("action", None))
+    if not reward.requires_grad and not steps:
         raise WrongState(
             f"{reward_key!r} carries no gradient. Collectors, ParallelEnv, replay buffers, .detach() and "
             "torch.no_grad() cut it. Use differentiable_rollout(env, actor, carry, horizon) with gradients enabled."
         )
     sources = _sources(inputs)
-    if not any(g is not None for g in _gradients(reward.sum(), sources)):
+    if reward.requires_grad and not any(g is not None for g in _gradients(reward.sum(), sources)):
         raise UserValueError(
             f"{reward_key!r} does not depend on the inputs. Give the actor that flew this rollout, or tensors "
             "from which its actions were computed."
@@ -168,10 +172,9 @@ def audit_reward(
     discount = discounts(done, torch.as_tensor(gamma, dtype=reward.dtype, device=reward.device))
     returns = {name: (discount * term).sum((-2, -1)) for name, term in terms.items()}
     sizes = {name: x.detach().abs().mean().item() for name, x in returns.items()}
-    steps = _steps(rollout.get("action", None))
     grads = {name: _gradients(x.mean(), [*sources, *steps]) for name, x in returns.items()}
     norms = {name: _vector(x, sources).norm().item() for name, x in grads.items()}
-    all_sizes, all_norms = (sum(x.values()) or 1.0 for x in (sizes, norms))
+    all_sizes, all_norms = (sum(filter(math.isfinite, x.values())) or 1.0 for x in (sizes, norms))
     audit = RewardAudit()
     for name, term in terms.items():
         shares = sizes[name] / all_sizes, norms[name] / all_norms
@@ -184,13 +187,23 @@ def audit_reward(
     traps = [*_jumping(reward.detach(), done, rollout.get((*beside, "state"), None))]
     traps += _ending(reward.detach(), ends, shape[-2] if gamma == 1.0 else 1.0 / (1.0 - gamma))
     traps += _large(rollout.get("observation", None))
+    if not reward.requires_grad:
+        traps.append(
+            "no term has a gradient, so that a first-order method cannot climb it: reward a distance, or say by events "
+            "when a bonus is paid, and give event_discount"
+        )
     for name, x in audit.items():
+        if x.verdict == "not finite":
+            traps.append(f"the gradient of {name!r} is not finite: clamp what roots, quotients and acos are taken of")
         if x.verdict == "differentiable":
             traps += _flat(name, terms[name], returns[name], grads[name][len(sources) :])
             if max(x.return_share, x.gradient_share) < 1e-3:
                 traps.append(f"{name!r} is less than a thousandth of return and gradient: it teaches nothing")
-    if done[..., 0, :].numel() > 1 and bool(done[..., 0, :].all()):
-        traps = ["all episodes end in their first step: look at the start, is_crash and is_success"]
+    begins = torch.cat((torch.ones_like(done[..., :1, :]), done[..., :-1, :]), -2)
+    dead = done[begins].double().mean().item()
+    if begins.sum() > 1 and dead > 0.05:
+        first = f"{dead:.0%} of the episodes end in their first step: look at the start, is_crash and is_success"
+        traps = [first, *(traps if dead < 1.0 else [])]
     audit.traps = traps
     return audit
 
@@ -200,7 +213,7 @@ def _jumping(reward: Tensor, done: Tensor, state: Any) -> Iterator[str]:
     reward, done = (x.reshape(-1, x.shape[-2]) for x in (reward, done))
     jumps, names, falls, usual = set(), [], [], 0.25 * (reward.quantile(0.9) - reward.quantile(0.1))
     for name, x in () if state is None else state.flatten_keys("/").items():
-        if x.dtype == torch.bool or name.startswith("drone/") or x.shape[: state.ndim] != state.shape:
+        if name.partition("/")[0] in _OF_THE_ENVIRONMENT or x.shape[: state.ndim] != state.shape:
             continue
         change = x.detach().to(reward).reshape(*reward.shape, -1).diff(dim=1).norm(dim=-1)
         alone = change[:, 1:-1] > 10.0 * torch.maximum(change[:, :-2], change[:, 2:]) + 1e-6
@@ -217,7 +230,8 @@ def _jumping(reward: Tensor, done: Tensor, state: Any) -> Iterator[str]:
         before, after = (sum(x) / len(falls) for x in zip(*falls, strict=True))
         yield (
             f"{', '.join(names)} jumped {len(jumps)} times, and a step then paid {after:.3g} instead of {before:.3g}: "
-            "waiting before an arrival pays more than arriving. Reward the velocity towards the target, or the arrival"
+            "if a drone that waits there is paid the same, waiting pays more than arriving. Reward the velocity "
+            "towards the target, or the arrival"
         )
 
 
@@ -230,10 +244,11 @@ def _ending(reward: Tensor, ends: Mapping[str, Tensor], steps: float) -> Iterato
     usual = reward[~terminated].mean().item()
     cost = reward[died].mean().item() if died.any() else 0.0
     if ("crash" in ends or died.any()) and usual < 0.0 and cost > steps * usual:
-        seen = f"costs {-cost:.3g}" if died.any() else "was not seen"
+        cheap = f"must cost more than {-steps * usual:.3g}, else dying is"
+        cheap = f"pays {cost:.3g}: dying is" if died.any() else cheap
         yield (
-            f"a step pays {usual:.3g} on average, {steps * usual:.3g} in {steps:.0f} steps, and a crash {seen}: dying "
-            "is cheap. Add a constant, so that a good step pays more than nothing, or let a crash cost more"
+            f"as this policy flies a step pays {usual:.3g} on average, {steps * usual:.3g} in {steps:.0f} steps, and a "
+            f"crash {cheap} cheap. Add a constant, so that a good step pays more than nothing, or let a crash cost more"
         )
     if success.all():
         yield "success is true in every step: an untrained policy solves the task. Ask for more in is_success"

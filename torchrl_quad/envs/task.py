@@ -222,7 +222,11 @@ def check_task(env: Task, state: State) -> None:
     def check_tensor(method: str, x: Any, dtype: torch.dtype | None, columns: int | None = 1) -> None:
         is_right = isinstance(x, Tensor) and x.shape == (n, columns or x.shape[-1:].numel())
         wanted = f"({n}, {columns or 'k'})" + ("" if dtype is None else f", {dtype}")
-        hint = " Sum a vector over its components: .sum(-1, keepdim=True)." if method.startswith("reward") else ""
+        hint = ""
+        if isinstance(x, numbers.Real):
+            hint = f" Write torch.full_like(state['position'][:, :1], {x})."
+        elif method.startswith("reward") and isinstance(x, Tensor):
+            hint = " Keep the last dimension: norm(x) of envs.terms, or .sum(-1, keepdim=True)."
         hint = " Convert it: .to(self.dtype)." if is_right and dtype == env.dtype else hint
         check(is_right and dtype in (None, x.dtype), f"{method} must be a tensor {wanted}; got {kind(x)}.{hint}")
 
@@ -249,6 +253,13 @@ def check_task(env: Task, state: State) -> None:
         check(is_mapping, f"{method} must be a mapping from names to tensors; got {type(entries).__name__}.")
         return ((f"{method}[{name!r}]", x) for name, x in entries.items())
 
+    random, twice = env.randomness.state(), []
+    for _ in range(2):
+        twice.append(env.initial_state(n))
+        env.randomness.set_state(random)
+    for key, x in twice[0].items():
+        again = not isinstance(x, Tensor) or torch.allclose(x, twice[1][key], equal_nan=True)
+        check(again, f"initial_state: {key!r} ignores the seed. Draw from self.uniform, .normal or .integers.")
     taken = {"step", "action_queue", "collided", "drone", "scene"}
     starts = {key: type(x).__name__ for x in env.disturbances.values() for key in x.start(env.randomness, state)}
     taken |= {key for key in starts if isinstance(key, str)}

@@ -46,6 +46,16 @@ def body_observation(state: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tenso
     return 10 * state["quaternion"], state["velocity"], state["angular_velocity"]
 
 
+def axes_observation(state: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """As :func:`body_observation`, with ten times the body's x and z axes in the world, (*, 6), for the quaternion.
+
+    For tasks that turn the drone about: after a full turn a quaternion has the other sign, and the axes are the same.
+    """
+    q = state["quaternion"]
+    ahead, _, up = (quaternion.rotate(q, x.expand_as(q[..., 1:])) for x in torch.eye(3, device=q.device, dtype=q.dtype))
+    return 10 * torch.cat((ahead, up), -1), state["velocity"], state["angular_velocity"]
+
+
 def target_reward(state: Mapping[str, Tensor], weights: Mapping[str, float]) -> dict[str, Tensor]:
     """The terms of "be at the target, level and still", each (*, 1): ``survival``, and four penalties."""
     level = quaternion.identity(state["quaternion"])

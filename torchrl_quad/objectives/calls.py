@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, cast
 
 import torch
@@ -19,10 +20,24 @@ from torchrl_quad.errors import Unsupported, UserTypeError, UserValueError
 from torchrl_quad.objectives.gaussian import GaussianPolicy
 
 
+@contextlib.contextmanager
+def holding(params: TensorDictParams, module: nn.Module) -> Iterator[None]:
+    """A module with other parameters, given back also where an exception leaves, or a key stops the program.
+
+    TensorDict's own context keeps them after an exception, and turns a KeyboardInterrupt into an error of its own.
+    """
+    held = params.to_module(module)
+    held.__enter__()
+    try:
+        yield
+    finally:
+        held.__exit__(None, None, None)
+
+
 def sample_action(actor: TensorDictModule, params: TensorDictParams, tensordict: TensorDictBase) -> TensorDictBase:
     """The states (*) with what a policy writes in them, sampled, with gradients in its parameters and in the states."""
     tensordict = tensordict.copy()
-    with set_exploration_type(ExplorationType.RANDOM), params.to_module(actor):
+    with set_exploration_type(ExplorationType.RANDOM), holding(params, actor):
         # A policy with memory or eyes is called.
         plain = actor.plain() if hasattr(actor, "plain") and not hasattr(actor, "replayed") else None
         if plain is None:
@@ -48,7 +63,7 @@ def predict(
         inputs, params = (inputs.detach(), params) if learning else (inputs, params.detach())
         predictions = []
         for own in params.unbind(0) if params.batch_dims else [params]:
-            with own.to_module(critic):
+            with holding(own, critic):
                 predictions.append(critic(inputs.copy()).get(key))
         return torch.stack(predictions)
     tensors = [leaf(tensordict, name) for name in critic.in_keys]
@@ -185,7 +200,7 @@ def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: Ten
     The gradients reach the policy's parameters alone, neither earlier states nor the noise. A memory is built up again
     from that at the start. Actions within 1e-6 of a bound count as if they were that far from it.
     """
-    with params.to_module(actor):
+    with holding(params, actor):
         return plain_of(actor, tensordict).replay(tensordict)
 
 

@@ -18,7 +18,7 @@ from torchrl.objectives.utils import ValueEstimators
 
 from torchrl_quad.data.unwrap import check_tensordict, leaf
 from torchrl_quad.errors import UserValueError, WrongState
-from torchrl_quad.objectives.calls import plain_of, takes_rollout
+from torchrl_quad.objectives.calls import holding, plain_of, takes_rollout
 from torchrl_quad.objectives.shac import SHACLoss
 from torchrl_quad.options import Below1, Coefficient, Field, Positive, Share
 
@@ -139,7 +139,7 @@ class HybridLoss(SHACLoss):
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's loss of what :meth:`forward` takes, and the weight, KL(policy that flew || policy), entropy."""
         keys, tensordict = self.tensor_keys, self._with_targets(tensordict)
-        with self.actor_network_params.to_module(self.actor_network):
+        with holding(self.actor_network_params, self.actor_network):
             plain = plain_of(self.actor_network, tensordict)
             new, old = Normal(*plain.distribution(tensordict)), Normal(*plain.recorded(tensordict))
         advantage, latent = leaf(tensordict, keys.advantage), leaf(tensordict, keys.latent)
@@ -174,7 +174,7 @@ class HybridLoss(SHACLoss):
 
     def _in_location(self, data: TensorDictBase, grad: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """From the gradient in the actions (*, k) that in their means before the tanh; u, and these means."""
-        with self.actor_network_params.to_module(self.actor_network):
+        with holding(self.actor_network_params, self.actor_network):
             plain = plain_of(self.actor_network, data)
             xi = plain.drawn_again(data)[:, : plain.size].view_as(grad)
             loc, scale = (x.detach() for x in plain.recorded(data))

@@ -337,7 +337,7 @@ class Run:
             except UserError as error:
                 traps = [str(error)]
         seconds = self.task.max_episode_steps * self.task.control_dt
-        limit = f"all episodes end by their time limit of {seconds:.3g} s: if that is too short, set max_episode_steps"
+        limit = f"all episodes end after {seconds:.3g} s: if drones still come nearer then, set max_episode_steps"
         for trap in [*traps, limit] if crash < 0.05 else traps:
             torchrl_logger.warning(f"Nothing is solved after {self.steps:,} steps. Perhaps {trap}.")
 

@@ -385,7 +385,7 @@ def test_a_mapping_reads_any_table_and_rates_are_matched(tmp_path):
     twice = tmp_path / "twice.csv"
     twice.write_text(path.read_text().replace("wz,", "wy,", 1))
     without = {k: v for k, v in mapping.items() if k != "motor_command"}
-    twin = mapping | {"angular_velocity": ("wx", "wy", "wx")}
+    twin = mapping | {"angular_velocity": ("wx", "wy", "fx")}
     nowhere = "no column nowhere, named for velocity.*There are: .*x, y"
     for error, message, file, columns in (
         (WrongQuaternion, "scalar last", path, listed),

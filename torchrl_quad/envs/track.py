@@ -192,12 +192,8 @@ def load_track(track: str | Path | Mapping = "visfly", **settings: Any) -> dict[
     source, values = _read(track, settings)
     values = own_format(source, values)
     if unknown := [key for key in values if key not in _PARTS]:
-        if not {"gates", "random"} & set(values):
-            why = (
-                f"has {shown(unknown[0])} and no gates: it is of no format that is known. Write gates, a list of points"
-            )
-            raise UserValueError(f"{source} {why} [x, y, z]; load_track names the formats it reads.")
-        raise UserValueError(f"{source}: unknown key {shown(unknown[0])}. Allowed: {', '.join(_PARTS)}.")
+        known = "" if {"gates", "random"} & set(values) else " Of other formats load_track reads those that it names."
+        raise UserValueError(f"{source}: unknown key {shown(unknown[0])}. Allowed: {', '.join(_PARTS)}.{known}")
     found = {key: check_value(f"{source}: {key}", values[key], *_KEYS[key]) for key in _KEYS if key in values}
     found |= {key: values[key] for key in ("scene", "notes") if key in values}
     shape = {key: found.pop(key) for key in _OPENING if key in found}

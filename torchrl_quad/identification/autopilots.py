@@ -137,23 +137,31 @@ def _add_signals(streams: dict[str, Stream], parameters: Mapping[str, float]) ->
         }
         stem = max(outputs, key=lambda x: moves[x])
         ports = {parameters.get(f"PWM_{p}_FUNC{n}"): (p, n) for p in ("AUX", "MAIN") for n in range(16, 0, -1)}
-        for k, motor in enumerate(order):
-            port, n = ports.get(101 + motor, ("MAIN", motor + 1))
-            pulses = streams[stem].columns.get(f"{stem}.output[{n - 1}]")
-            own = [parameters.get(f"PWM_{port}_{x}{n}", -1.0) for x in ("MIN", "MAX")]
-            usual = parameters.get("PWM_MIN", 1000.0), parameters.get("PWM_MAX", 2000.0)
-            low, high = (x if x > 0.0 else y for x, y in zip(own, usual, strict=True))
-            if pulses is not None and high > low:
-                unit, most = "pulses", float(np.nanmax(pulses))
-                if np.nanmin(pulses) < 0.0:
-                    why = f"{stem} runs from {np.nanmin(pulses):g} to {most:g}: no pulses from {low:g} to {high:g} us"
-                    raise WrongMotors(f"{why}. Write the commands, 0 to 1, into a CSV, and give that.")
-                if most <= 1.01:
-                    unit, low, high = "shares", 0.0, 1.0
-                elif 1000.0 < most < 2048.0 and np.nanmin(pulses[pulses > 0.0]) < 700.0:
-                    unit, low, high = "DShot", 0.0, 1999.0
-                signals[f"actuator_outputs.signal[{k}]"] = np.where(pulses < low, 0.0, (pulses - low) / (high - low))
-                said = f"{stem}, {unit} from {low:g} to {high:g}{' us' if unit == 'pulses' else ''}"
+        places = [ports.get(101 + motor, ("MAIN", motor + 1)) for motor in order]
+        all_four = {k: streams[stem].columns.get(f"{stem}.output[{n - 1}]") for k, (_, n) in enumerate(places)}
+        pulses = {k: x for k, x in all_four.items() if x is not None}
+        reached = np.concatenate([*pulses.values(), np.zeros(1)])
+        least, most = float(np.nanmin(reached)), float(np.nanmax(reached))
+        begun = float(np.nanmin(reached, where=reached > 0.0, initial=most))
+        is_dshot = parameters.get("DSHOT_CONFIG", 0.0) > 0.0 and most < 2048.0
+        for k, x in pulses.items():
+            port, n = places[k]
+            usual = [parameters.get(f"PWM_{port}_{y}", parameters.get(f"PWM_{y}", -1.0)) for y in ("MIN", "MAX")]
+            own = [parameters.get(f"PWM_{port}_{y}{n}", -1.0) for y in ("MIN", "MAX")]
+            low, high = (
+                next((z for z in y if z > 0.0), at) for *y, at in zip(own, usual, (1000.0, 2000.0), strict=True)
+            )
+            unit = "pulses"
+            if least < 0.0:
+                why = f"{stem} runs from {least:g} to {most:g}: no pulses from {low:g} to {high:g} us"
+                raise WrongMotors(f"{why}. Write the commands, 0 to 1, into a CSV, and give that.")
+            if most <= 1.01:
+                unit, low, high = "shares", 0.0, 1.0
+            elif is_dshot or (1000.0 < most < 2048.0 and begun < 700.0):
+                unit, low, high = "DShot", 0.0, 1999.0
+            if high > low:
+                signals[f"actuator_outputs.signal[{k}]"] = np.where(x < low, 0.0, (x - low) / (high - low))
+            said = f"{stem}, {unit} from {low:g} to {high:g}{' us' if unit == 'pulses' else ''}"
     if signals:
         streams[stem] = Stream(stem, streams[stem].time, {**streams[stem].columns, **signals})
     return f"motor commands are in {said}{', placed by CA_ROTOR' if placed else ''}"
@@ -414,7 +422,9 @@ def _with_signals(outputs: Stream, parameters: Mapping[str, float], name: str, n
         many = _FRAMES.get(frame, str(len(functions)))
         said = f"{name} is the log of a drone with {many} rotors (FRAME_CLASS {frame})."
         raise WrongMotors(f"{said} Only four are fitted.")
-    low, high = parameters.get("MOT_PWM_MIN", 0.0), parameters.get("MOT_PWM_MAX", 0.0)
+    throttle = f"RC{parameters.get('RCMAP_THROTTLE', 3):g}"  # whose range counts where MOT_PWM_MIN is 0
+    ends = [(f"MOT_PWM_{x}", f"{throttle}_{x}") for x in ("MIN", "MAX")]
+    low, high = (next((parameters[x] for x in names if parameters.get(x)), 0.0) for names in ends)
     low, high = (low or 1000.0), (high if high > low else 2000.0)
     signals = dict(outputs.columns)
     for k in range(4):

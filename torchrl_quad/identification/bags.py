@@ -114,6 +114,9 @@ def _number(message: Any, place: Sequence[str]) -> float:
     return float(message)
 
 
+_ASKED_FOR = re.compile("command|setpoint|target|goal|reference|desired")  # in topics of where a drone shall be
+
+
 def _layout(bag: Any, topics: Mapping[str, str], columns: Asked, name: str) -> Layout:
     if columns is not None and not isinstance(columns, Mapping):
         return choose(columns, None)
@@ -129,11 +132,11 @@ def _layout(bag: Any, topics: Mapping[str, str], columns: Asked, name: str) -> L
     for kind, quantities in shipped("ros_messages.yaml").items():
         topics_of_kind = sorted(topic for topic in topics if topics[topic] == kind)
         for quantity, fields in quantities.items():
-            own, rival = topics_of_kind, rivals.get(quantity)
+            own, rival = [x for x in topics_of_kind if not _ASKED_FOR.search(x)], rivals.get(quantity)
             if of and quantity in pose:  # the caller means the pose of that topic only
                 own = [topic for topic in own if topic in of]
             if kind.endswith("/Actuators"):  # whose messages hold commands, or speeds
-                own = [topic for topic in own if _length(bag, topic, fields["of"], name)]
+                own = [topic for topic in topics_of_kind if _length(bag, topic, fields["of"], name)]
             if not own or {quantity, rival} & named or quantity in found or (rival in found and rival != "velocity"):
                 continue
             choice = named_alike(**fields | {"of": f"{own[0]}.{fields.get('of', '')}"})

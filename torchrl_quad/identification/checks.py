@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from torchrl_quad.deploy.frames import Convention, px4
-from torchrl_quad.identification.errors import Remedy, WrongFrame, WrongQuaternion, WrongUnit, in_units
+from torchrl_quad.identification.errors import NotOneDrone, Remedy, WrongFrame, WrongQuaternion, WrongUnit, in_units
 from torchrl_quad.identification.layouts import G
 from torchrl_quad.identification.signals import Array, Mask, Signal, body_rates, slope, smooth
-from torchrl_quad.rotations import rotate, rotate_inverse
+from torchrl_quad.rotations import continuous, multiply, rotate, rotate_inverse
 
 MAX_LAG = 0.3  # [s] between streams
 CALM = 0.1  # [rad/s]: slower rotations are lost in the noise of motion capture
@@ -78,6 +79,14 @@ def check_velocity(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: f
     derived = smooth(slope(at["position"], dt), dt)
     speed = np.linalg.norm(derived[moving], axis=-1)
     place = signals["position"]
+    steps = np.diff(place.values, axis=0)
+    to_and_fro = (steps[1:] * steps[:-1]).sum() < -0.5 * (steps * steps).sum()
+    steps = np.linalg.norm(steps, axis=-1)
+    if to_and_fro and np.median(steps) > 0.05:
+        raise NotOneDrone(
+            f"{place} jumps to and fro from row to row, by {np.median(steps):.3g} m in the median: are there rows of "
+            "several drones? Keep those of one."
+        )
     if np.percentile(speed, 99) > 100.0:
         said = f"By {place} the drone flies at {np.percentile(speed, 99):.3g} m/s."
         raise WrongUnit(said, *in_units("position", "the position is in", millimetres=1e-3, centimetres=1e-2))
@@ -185,6 +194,11 @@ def check_rates(
     turn, apart = _turn(smooth(gyro, dt), right, dt, moving)
     turned = _compare(smooth(gyro @ turn.T, dt), right, dt, moving)[0]
     told = f"{signal} correlates with the derivative of {given} by {fit:.2f} as given, and"
+    if given.field == "euler":
+        other, how = _other_angles(logged, theirs, gyro, dt, moving)
+        most = max(fits[best][0], turned)
+        if other > max(0.9, most) and (other > most + SURE or (most < 0.99 and 1.0 - other < 0.3 * (1.0 - most))):
+            raise WrongFrame(f"{told} by {other:.3f} if {how}. Give quaternions instead of angles.")
     if turned > max(0.8, fits[best][0] + SURE):
         raise WrongFrame(
             f"{told} by {turned:.2f} if the body of the attitude is {apart}. Bring all of the log into one body: x "
@@ -207,6 +221,16 @@ def check_rates(
     for unit, scale in (("degrees", np.pi / 180.0), ("milliradians", 1e-3)):
         if 1.0 / 3.0 < factor * scale < 3.0 and fit > 0.2:
             raise WrongUnit(f"{said} {unit}/s.", {"quantity": signal.field, "factor": scale})
+    derive: Remedy
+    for k, axis in enumerate(_AXES):
+        one, other = (x[moving, k].std() for x in (smooth(gyro, dt), right))
+        along = _compare(smooth(gyro, dt)[:, [k]], right[:, [k]], dt, moving)[0]
+        counts = max(one, other) > max(3.0 * CALM, 0.3 * turning) and fit > 0.5
+        if counts and (along < 0.3 or 10.0 * min(one, other) < max(one, other)):
+            raise WrongFrame(
+                f"About {axis} {signal} does not turn as {given}: by {one:.2g} and {other:.2g} rad/s, correlated by "
+                f"{along:.2f}. Name columns of both."
+            )
     if turning < CALM:
         return calm
     derive = {"quantity": signal.field, "drop": True, "when": "the rates shall follow from the attitude"}
@@ -224,9 +248,34 @@ def check_rates(
     return f"{signal} fits the attitude: correlation {fit:.2f}, {1000.0 * lag:+.0f} ms late{size}"
 
 
+def _other_angles(q: Array, theirs: Convention, gyro: Array, dt: float, moving: Mask) -> tuple[float, str]:
+    """How well a gyro follows roll, pitch and yaw that are read in the best of all other orders, and in which."""
+    w, x, y, z = q.T
+    angles = [np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)), np.arcsin(np.clip(2 * (w * y - x * z), -1, 1))]
+    angles = np.unwrap(np.stack([*angles, np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))], -1), axis=0)
+    length = np.linalg.norm(angles, axis=-1, keepdims=True)
+    vector = np.concatenate((np.cos(length / 2), np.sin(length / 2) * angles / length.clip(1e-9)), -1)
+    found = {"the angles are a rotation vector": vector}
+    halves = [np.insert(np.zeros((len(q), 3)), 0, np.cos(a / 2), axis=1) for a in angles.T]
+    for k, half in enumerate(halves):
+        half[:, k + 1] = np.sin(angles[:, k] / 2)
+    for order in itertools.permutations(range(3)):
+        name = f"the angles turn about the body's {', then '.join('xyz'[k] for k in order)}"
+        found[name] = multiply(multiply(halves[order[0]], halves[order[1]]), halves[order[2]])
+    fits = {}
+    for name, turned in found.items():
+        read = theirs.back({"quaternion": continuous(turned)})["quaternion"]
+        fits[name] = _compare(smooth(gyro, dt), smooth(body_rates(read, dt), dt), dt, moving)[0]
+    best = max(fits, key=lambda name: fits[name])
+    return fits[best], best
+
+
 def _clock(factor: float) -> Remedy:
     """For what is ``factor`` times its derivative by a clock."""
-    return {"quantity": "time", "factor": float(f"{1.0 / factor:.2g}"), "when": "time does not count seconds"}
+    known = [y for x in (2, 3, 4, 5, 10, 20, 60, 100, 1000, 3600) for y in (x, 1.0 / x)]
+    nearest = min(known, key=lambda x: abs(np.log(x * factor)))
+    rounded = nearest if 0.75 < nearest * factor < 1.33 else float(f"{1.0 / factor:.2g}")
+    return {"quantity": "time", "factor": rounded, "when": "time does not count seconds"}
 
 
 def _turn(gyro: Array, right: Array, dt: float, moving: Mask) -> tuple[Array, str]:
@@ -305,6 +354,13 @@ def check_lean(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float
             _NED,
             *_EULER,
         )
+    swing, speeding = (float(x[rows].std(0).max()) for x in (tilt, pull))
+    if swing > 4.0 * LEAN and speeding < 0.2 * swing:
+        raise WrongFrame(
+            f"By {signals['quaternion']} the drone leans to and fro by {np.degrees(np.arctan(swing / G)):.0f} degrees, "
+            f"and by {signals['position']} it hardly accelerates: the position stands still, or the clock is too slow. "
+            "Give a log in which both were measured."
+        )
     sides = [_compare(tilt[:, [k]], pull[:, [k]], dt, moving)[0] for k in (0, 1)]
     apart = any(x < 0.3 and min(tilt[rows, k].std(), pull[rows, k].std()) >= LEAN for k, x in enumerate(sides))
     if apart or (moves and leans and (given < 0.5).all()):
@@ -313,9 +369,11 @@ def check_lean(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float
             "turned about z, mirrored, or up to 0.3 s late. Name columns of one world, with z up, and of one clock."
         )
     gain = float(pull[rows].std(0).max() / max(tilt[rows].std(0).max(), 1e-12))
-    pushed = up[:, :2] * np.linalg.norm(force + (0.0, 0.0, G), axis=-1, keepdims=True)  # less where rotors hardly turn
-    ratio = float(force[rows, :2].std(0).max() / max(pushed[rows].std(0).max(), 1e-12))
-    sure = given.min() > (0.6 if moves else 0.85) and not 0.6 < ratio < 1.7
+    carried = rows[thrust[rows, 2] > 0.3 * G]  # where rotors turn: the thrust leans as the drone does
+    slopes = [np.linalg.norm(x[carried, :2] / x[carried, 2:], axis=-1) for x in (thrust, up)]
+    steep = slopes[1] > (0.1 if (slopes[1] > 0.1).sum() * dt > 1.0 else -1.0)
+    ratio = float(np.median(slopes[0][steep]) / max(np.median(slopes[1][steep]), 1e-12)) if steep.any() else 1.0
+    sure = given.min() > (0.6 if moves else 0.85) and not 0.5 < ratio < 2.0
     if (moves or leans) and sure and not 0.4 < gain < 2.5:
         lengths = {"centimetres": 1e-2, "millimetres": 1e-3, "feet": 0.3048}
         near = {k: x for k, x in lengths.items() if 0.6 < gain * x < 1.7}

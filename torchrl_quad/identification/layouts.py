@@ -110,6 +110,8 @@ def _as_columns(quantity: object, names: object) -> Columns:
             f"Unknown quantity {shown(quantity)} in columns. Choose from: {', '.join(sizes)}, setpoint.NAME."
         )
     size = sizes.get(quantity, count)
+    if len(set(names.names)) < count:
+        raise MissingColumns(f"{quantity} names a column twice: {', '.join(names.names)}. Name {count} columns.")
     if count != size:
         raise MissingColumns(f"{quantity} takes {size} column(s), got {count}: {', '.join(names.names)}. Name each.")
     return names
@@ -183,7 +185,7 @@ def gather(layout: Layout, streams: Sequence[Stream], name: str) -> dict[str, Si
         with np.errstate(over="ignore", invalid="ignore"):  # damage makes NaN and numbers of any size
             values = np.stack([np.asarray(stream.columns[column], float) for column in choice.names], -1)
             values = (values - np.asarray(choice.offset, float)) * np.asarray(choice.scale, float)
-        values[~(np.abs(values) < LARGEST)] = np.nan
+        values[~(np.abs(values) < LARGEST) | np.isin(values, (-9999.0, -99999.0, 99999.0))] = np.nan
         setpoint = quantity.removeprefix("setpoint.")
         _, alike = QUANTITIES.get(quantity, (0, setpoint if setpoint in _TRANSLATED else None))
         if alike and not (alike == "motors" and layout.convention.motors is None):
@@ -222,8 +224,10 @@ def blackbox(name: str) -> MissingColumns:
 
 
 def _columns_there(names: Iterable[str], asked: Sequence[str] = ()) -> str:
+    names = [*names]
+    time = "" if any("." in name for name in names) else '"time": "t", '  # of an autopilot, which has its clock
     return (
-        'Name them: columns={"time": "t", "position": ["x", "y", "z"], ...}. '
+        f'Name them: columns={{{time}"position": ["x", "y", "z"], ...}}. '
         f"There are{listed(names, [*asked, *QUANTITIES])}."
     )
 

@@ -240,18 +240,21 @@ def _signals(layout: Layout, streams: Sequence[Stream], name: str, notes: list[s
             f"motor_command with speed_per_volt {FULL_SPEED:g}, nominal_voltage 1 and delay 0 keeps the speeds; they "
             f"reach {np.nanmax(np.abs(speeds.values)):.4g}, taken as rad/s"
         )
-    motors = gathered["motor_command"].columns
+    motors, tables = gathered["motor_command"].columns, [x for x in streams if x.name == "csv"]  # others have arrays
     last = _next(max(motors))  # m5 after m4
     if last == max(motors):  # e after d
         last = f"{last[:-1]}{chr(ord(last[-1]) + 1)}"
     next_one = _next(last)
-    if last not in motors and next_one != last and any({last, next_one} <= stream.columns.keys() for stream in streams):
+    if last not in motors and next_one != last and any({last, next_one} <= x.columns.keys() for x in tables):
         raise WrongMotors(
             f"{last} and {next_one} look like a fifth and a sixth motor. Only drones with four rotors are fitted; if "
             "they are no motors, leave their columns out."
         )
-    if last not in motors and any(last in stream.columns for stream in streams):
+    if last not in motors and any(last in x.columns for x in tables):
         notes.append(f"{last} looks like a fifth motor: only {', '.join(motors)} are read, of a drone with four rotors")
+    q, place = gathered.get("quaternion"), gathered["position"]
+    if q is not None and q.time is place.time:
+        place.values[~q.values.any(-1)] = np.nan  # trackers write zeros for what they do not see
     for quantity, signal in gathered.items():
         if quantity == "battery_voltage" and not (signal.values > 0.0).any():
             continue  # autopilots say 0 where no battery is measured

@@ -127,6 +127,10 @@ def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
     samples = list(itertools.islice(rows, 2))
     if len(samples) < 2:
         raise UnreadableLog(f"{name} has fewer than two samples below its header. Give the log of a flight.")
+    if len(header) < 3 and max(row.count(_mark(row) or " ") for row in samples) > 2:
+        raise UnreadableLog(
+            f"{name}: its first row, {shown(first)}, names no columns: delete the lines above their names."
+        )
     if samples[0].count(mark or " ") == len(header) and samples[0].endswith(mark or " "):
         header.append("")  # a separator ends each row but the first
     for k, row in enumerate(samples):  # before anything is said of its columns: it may be no table
@@ -165,9 +169,15 @@ def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
     values = dict.fromkeys(header, np.broadcast_to(np.nan, len(table)))  # the others are never read
     values |= dict(zip(place, table.T, strict=True))
     time = (values[clock] - np.asarray(layout.time.offset)) * np.asarray(layout.time.scale)
-    if not np.isfinite(time).any():
-        said = _cells(samples[0], mark, len(header), name, 0)[header.index(clock)]
-        raise UnreadableLog(f"{name}: the time in {clock} is no number, but {shown(said)}. Write it in seconds.")
+    if np.isfinite(time).mean() < 0.9:
+        odd = next((k for k in range(len(samples)) if not np.isfinite(time[k])), None)
+        said = (
+            f", but {shown(_cells(samples[odd], mark, len(header), name, odd)[header.index(clock)])}"
+            if odd is not None
+            else ""
+        )
+        lost = f"in {np.mean(~np.isfinite(time)):.0%} of the rows"
+        raise UnreadableLog(f"{name}: the time in {clock} is no number{said} {lost}. Write it in seconds, as 1234.5.")
     return [Stream("csv", time, values)], layout, notes
 
 

@@ -101,6 +101,7 @@ def test_a_bad_value_is_refused_by_name(kwargs, message):
     ("is_crash", lambda _, s: s["position"][:, :1], r"is_crash\(state\) must be a tensor \(4, 1\), torch.bool"),
     ("advance", lambda _, p, s: {"position": s["position"]}, "advance must return the whole state, and 'target'"),
     ("advance", lambda _, p, s: {**s, "target": s["target"].double()}, "float32.; got .* torch.float64"),
+    ("advance", lambda _, p, s: {**s, "legs": s["step"]}, "advance gives 'legs', which the state lacks"),
     ("events", lambda _, p, s: {"near": 0.5}, r"\['near'\] must be an Event; got float"),
     ("events", lambda _, p, s: {"near": near(s, happened=s["step"])}, r"\.happened must be .* torch.bool; got"),
     ("events", lambda _, p, s: {"near": near(s, time=s["position"])}, r"\.time must be a tensor \(4, 1\), .* got"),

@@ -312,6 +312,11 @@ def check_task(env: Task, state: State) -> None:
         check_tensor(f"{method}(state)", call(method, state), torch.bool)
     advanced = call("advance", state, state)
     named("advance(previous, state)", advanced)
+    for key in advanced.keys() - state.keys():
+        check(
+            False,
+            f"advance gives {key!r}, which the state lacks and would lose. Give it in initial_state, too.",
+        )
     for key in env.task_entries:
         got, wanted = kind(advanced.get(key)), kind(state[key])
         check(

@@ -107,9 +107,9 @@ def audit_reward(
     A verdict holds for this rollout alone, of any differentiable environment. Start it where all terms are paid, and
     make it longer than the delay between an action and its effect. Its ``traps`` mislead a policy: waiting pays
     more than an arrival after which the target jumps; dying is cheap where steps pay less than nothing; loitering pays
-    more than a success that ends the episode; success is always true; a term is flat in most flights, or too small to
-    matter; an observation is far from one. To go on counts
-    as 1 / (1 - gamma) steps, for a gamma of 1 as the horizon.
+    more than a success that ends the episode; success is always true; starts crash at once; a term is flat in most
+    flights, too small to matter, or without a finite gradient; an observation is far from one. To go on counts as
+    1 / (1 - gamma) steps, for a gamma of 1 as the horizon.
 
     Args:
         rollout: (*, horizon) with its graph, as ``differentiable_rollout`` returns it.
@@ -185,7 +185,8 @@ def audit_reward(
     ends = {name: leaf(rollout, (*beside, name)) for name in said}
     audit.unseen = [name for name in said if name != "terminated" and not ends[name].any()]
     traps = [*_jumping(reward.detach(), done, rollout.get((*beside, "state"), None))]
-    traps += _ending(reward.detach(), ends, shape[-2] if gamma == 1.0 else 1.0 / (1.0 - gamma))
+    collided: Any = rollout.get((*beside, "state", "collided"), torch.zeros_like(done))
+    traps += _ending(reward.detach(), ends, collided, shape[-2] if gamma == 1.0 else 1.0 / (1.0 - gamma))
     traps += _large(rollout.get("observation", None))
     if not reward.requires_grad:
         traps.append(
@@ -200,7 +201,7 @@ def audit_reward(
             if max(x.return_share, x.gradient_share) < 1e-3:
                 traps.append(f"{name!r} is less than a thousandth of return and gradient: it teaches nothing")
     begins = torch.cat((torch.ones_like(done[..., :1, :]), done[..., :-1, :]), -2)
-    dead = done[begins].double().mean().item()
+    dead = ends.get("crash", done)[begins].double().mean().item()
     if begins.sum() > 1 and dead > 0.05:
         first = f"{dead:.0%} of the episodes end in their first step: look at the start, is_crash and is_success"
         traps = [first, *(traps if dead < 1.0 else [])]
@@ -235,7 +236,7 @@ def _jumping(reward: Tensor, done: Tensor, state: Any) -> Iterator[str]:
         )
 
 
-def _ending(reward: Tensor, ends: Mapping[str, Tensor], steps: float) -> Iterator[str]:
+def _ending(reward: Tensor, ends: Mapping[str, Tensor], collided: Tensor, steps: float) -> Iterator[str]:
     """Ends of episodes that pay more than going on, and successes that pay less."""
     never = torch.zeros_like(reward, dtype=torch.bool)
     terminated, success, crash = (ends.get(name, never) for name in ("terminated", "success", "crash"))
@@ -249,6 +250,7 @@ def _ending(reward: Tensor, ends: Mapping[str, Tensor], steps: float) -> Iterato
         yield (
             f"as this policy flies a step pays {usual:.3g} on average, {steps * usual:.3g} in {steps:.0f} steps, and a "
             f"crash {cheap} cheap. Add a constant, so that a good step pays more than nothing, or let a crash cost more"
+            + ("; these were collisions, which state['collided'] tells" if died.any() and collided[died].all() else "")
         )
     if success.all():
         yield "success is true in every step: an untrained policy solves the task. Ask for more in is_success"

@@ -4,7 +4,8 @@ python recipes/import_drone.py cf2x.urdf motor_time_constant=0.07
 
 It writes a YAML file, with its source and every assumption in comments, and says which fields the file lacks. Settings:
 
-    output=PATH          the file to write; without it, outputs/drones/NAME.yaml, by the entry, the file, or its folder
+    output=PATH          the file to write, never over another one; without it, outputs/drones/NAME.yaml, by the entry,
+                         the file, or its folder
     entry=NAME           which drone, of a file that has several
     FIELD=NUMBERS        what the file does not say, in SI units, such as linear_drag=[0.1,0.1,0.1]
 """
@@ -30,8 +31,8 @@ def main() -> None:
         raise UserValueError(f"output={output} is the file that is read. Choose another.")
     if output.suffix not in (".yaml", ".yml"):
         raise UserValueError(f"output={output}: it is written in YAML, so its name must end in .yaml.")
-    text, kept = import_drone(path, **cfg), output.read_text() if output.is_file() else None
-    if kept not in (None, text):
+    text = import_drone(path, **cfg)
+    if output.is_file() and output.read_bytes() != text.encode():
         raise UserValueError(f"{output} exists, and says something else. Remove it, or write output=ANOTHER.yaml.")
     make_folder(output.parent)
     with replacing(output) as temporary:

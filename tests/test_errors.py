@@ -112,7 +112,7 @@ def test_a_bad_value_is_refused_by_name(kwargs, message):
     (
         "initial_state",
         lambda env, n: {**HoveringEnv.initial_state(env, n), "legs": torch.rand(n, 1)},
-        "initial_state: 'legs' ignores the seed. Draw from self.uniform",
+        "initial_state: 'legs' differs between calls with one seed. Draw from self.uniform",
     ),
     ("initial_state", adding(legs=torch.zeros(4, 1).int()), r"'legs' must be .* int64 or bool; got .* torch.int32\)"),
 )

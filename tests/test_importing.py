@@ -187,7 +187,7 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_th
     (
         "x.sdf",
         sdf(FRAME.replace("0.1 0 0 0<", "0.1 3.141592654 0 0<") + motors()),
-        r"does not say rotor_direction .*: z of rotor_0 does not point up.*, rotor_direction=\[\[0,0,1\],",
+        r"does not say rotor_direction .*: the axis of rotor_0 does not point up.*, rotor_direction=\[\[0,0,1\],",
     ),
     ("x.urdf", URDF.format("cf", 0).replace("'prop", "'w"), "rotor_positions .* no link is named"),
     (
@@ -196,7 +196,7 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_th
         "mass .*, linear_drag .*: it follows from the drag of the rotors",
     ),
     ("x.sdf", sdf(FRAME + motors(rotorDragCoefficient=1)), "linear_drag .*: rotors differ in rotorDragCoefficient"),
-    ("x.sdf", sdf(FRAME.replace("base_link", "wheel_1")), "it has 'wheel_1', and a drone here has rotors alone"),
+    ("x.sdf", sdf(FRAME.replace("base_link", "wheel_1")), "the link 'wheel_1' looks like a wheel or a wing"),
     ("x.sdf", "<sdf><world><include/></world></sdf>", "a world that includes its models"),
     ("x.sdf", sdf(FRAME + motors(linkName="gone")), "the linkName of a motor, 'gone', is that of no link"),
     ("x.urdf", "<robot><link name='{{ name }}'/></robot>", "a template of Jinja"),

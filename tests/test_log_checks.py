@@ -59,7 +59,7 @@ FAULTS = {  # what changes, how it is named, and what the message says
     "constant motors": (
         own_table(T, motor_command=np.full((len(T), 4), 0.5)),
         TABLE,
-        "never change. Name the commands",
+        "never changes. Name the commands",
     ),
     "a motor twice": (
         own_table(T),

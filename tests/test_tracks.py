@@ -338,7 +338,7 @@ SQUARE = {"position": [0, 0, 2], "yaw": 0.0, **OPEN}
     ({"gates": {"first": [0, 0, 1]}}, {}, "its gates have names, .* of no format that is known"),
     ({"gates": [[0, 0, 1], SQUARE]}, {}, "gates must be all points, or all mappings"),
     ({"gates": [SQUARE, {**SQUARE, "rotation": [1, 0, 0, 0]}]}, {}, "gate 2: give a yaw, .* or a rotation"),
-    ({"quadrotor_config": {}}, {}, "unknown key .quadrotor_config.. Allowed: gates.* Of other formats load_track"),
+    ({"quadrotor_config": {}}, {}, "unknown key .quadrotor_config.. Allowed: gates.* help of load_track lists"),
     ({"gates": [SQUARE, {**SQUARE, "wide": 1}]}, {}, "gate 2: unknown key 'wide'. Allowed: position, yaw"),
     ({"gates": [[0, 0, 1], [1, 1, 1]], "frame": 0.1}, {}, "frame is of gates with a direction; these are points"),
     ({"random": {"gates": 3, "turn": 2.0}}, {"radius": 1.0}, "3 gates need a turn of at least 2.09 rad, got 2"),

@@ -158,7 +158,7 @@ def audit_reward(
             "name the one before it, reward_key=..."
         )
     steps = _steps(rollout.get("action", None))
-    if not reward.requires_grad and not steps:
+    if not reward.requires_grad and (not steps or any(x.requires_grad for x in terms.values())):
         raise WrongState(
             f"{reward_key!r} carries no gradient. Collectors, ParallelEnv, replay buffers, .detach() and "
             "torch.no_grad() cut it. Use differentiable_rollout(env, actor, carry, horizon) with gradients enabled."
@@ -190,21 +190,21 @@ def audit_reward(
     traps += _large(rollout.get("observation", None))
     if not reward.requires_grad:
         traps.append(
-            "no term has a gradient, so that a first-order method cannot climb it: reward a distance, or say by events "
-            "when a bonus is paid, and give event_discount"
+            "no term has a gradient, so first-order methods cannot learn from this reward: reward a distance, or say "
+            "by events when a bonus is paid, and give event_discount"
         )
     for name, x in audit.items():
         if x.verdict == "not finite":
-            traps.append(f"the gradient of {name!r} is not finite: clamp what roots, quotients and acos are taken of")
+            traps.append(f"the gradient of {name!r} is not finite: clamp the arguments of roots, quotients and acos")
         if x.verdict == "differentiable":
             traps += _flat(name, terms[name], returns[name], grads[name][len(sources) :])
             if max(x.return_share, x.gradient_share) < 1e-3:
                 traps.append(f"{name!r} is less than a thousandth of return and gradient: it teaches nothing")
-    begins = torch.cat((torch.ones_like(done[..., :1, :]), done[..., :-1, :]), -2)
+    begins = torch.cat((torch.zeros_like(done[..., :1, :]), done[..., :-1, :]), -2)  # a rollout may begin within one
     dead = ends.get("crash", done)[begins].double().mean().item()
-    if begins.sum() > 1 and dead > 0.05:
+    if dead > 0.05:  # which NaN is not, where no episode begins
         first = f"{dead:.0%} of the episodes end in their first step: look at the start, is_crash and is_success"
-        traps = [first, *(traps if dead < 1.0 else [])]
+        traps = [first] if done[..., 0, :].all() else [first, *traps]
     audit.traps = traps
     return audit
 

@@ -129,7 +129,7 @@ def check_flown(controller: FlightController, flown: QuadrotorParams, dt: float)
             ("motors of {} s", true[1], believed[1]),
             ("rotors that give {} times the torque", stronger.round(2), np.ones_like(stronger)),
         )
-        apart = [(how.format(listed(x)), listed(y)) for how, x, y in parts if not np.allclose(x, y, rtol=0.01)]
+        apart = [(how.format(listed(x)), listed(y)) for how, x, y in parts if not np.allclose(x, y, rtol=1e-3)]
         raise UserValueError(
             f"drone: in steps of dt={dt:g} s the rate loop is unstable with {', '.join(x for x, _ in apart)}, since "
             f"its gains are for {', '.join(y for _, y in apart)}. "

@@ -286,19 +286,21 @@ def _by_angles(said: Said) -> Found:
     by_number = isinstance(rotors, Mapping) and all(isinstance(x, Mapping) for x in rotors.values())
     if by_number:
         each = [rotors[k] for k in sorted(rotors, key=lambda k: str(k).zfill(3))]
-        rotors = {theirs: [x.get(ours) for x in each] for ours, theirs in names.items()}
+        rotors = {theirs: [x[ours] for x in each] for ours, theirs in names.items() if all(ours in x for x in each)}
     part = Said(rotors if isinstance(rotors, Mapping) else {}, f"{said.source}: rotor_configuration", {})
-    angle, arm, turn, force, torque = (part(name, None) for name in names.values())
-    found, fastest = said.fields(mass="mass"), part("max_rotation_velocities", None)
-    if isinstance(inertia, Mapping) and set(AXES) <= set(inertia):
-        found |= diagonal(symmetric(*(Said(inertia, f"{said.source}: inertia", {})(axes) for axes in AXES)))
+    n = next((len(x) for x in part.data.values() if isinstance(x, list)), None)
+    angle, arm, turn, force, torque = (part(name, n) for name in names.values())
+    found, fastest = said.fields(mass="mass"), part("max_rotation_velocities", n)
+    if isinstance(inertia, Mapping) and None not in map(inertia.get, AXES[:3]):
+        moments = Said(dict.fromkeys(AXES, 0.0) | dict(inertia), f"{said.source}: inertia", {})
+        found |= diagonal(symmetric(*(moments(axes) for axes in AXES)))
     if angle is not None and arm is not None:
         found |= placed((arm * [np.cos(angle), np.sin(angle), 0.0 * angle]).T.round(9), note="arms at their angles")
     if turn is not None:
         found["rotor_spin"] = -turn, "against direction, which is 1 counter-clockwise"
     if fastest is not None:
         found["rotor_speed_max"] = same(fastest, "max_rotation_velocities")
-    if force is not None:
+    if force is not None and force.all():
         k2, why = same(force, "their force constants")
         found["thrust_map"] = (None if k2 is None else [k2, 0.0, 0.0]), why
         if torque is not None:  # of RotorS per force

@@ -33,7 +33,8 @@ from torchrl_quad.errors import UserValueError, one_line, shown
 _NUMBERED, _PLACED = r"{0}\D{{0,20}}\d", r"\d_?{0}|(left|right|front|rear|back).*{0}|{0}.*(left|right|front|rear|back)"
 _OTHER = "guard|arm|mount|adapter|hub|base|shaft", "guard"  # what a rotor is not called; the second where all are
 _TURNING = ("revolute", "continuous", "prismatic", "universal", "ball", "screw")  # joints
-_GROUND = "wheel|(?<!s)wing|aileron|elevon|elevator|rudder"  # what links of other vehicles are called
+# What links of other vehicles are called.
+_OTHERS = r"(?<![a-z])(left|right|main|front|rear|back)?(wheel|wing|aileron|elevon|elevator|rudder)s?(?![a-z])"
 DEPTH = 20  # of models, joints and frames within each other
 # Of each link: its mass, the frame of its centre of mass, its inertia there (NaN where nothing is said), and two
 # directions: of its z axis, and of the axis that it turns about.
@@ -50,12 +51,11 @@ def read_xml(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
     elif models:
         drone = max(models, key=lambda model: len([*model.iter("plugin"), *model.iter("include")]))  # not the ground
         _add_sdf(drone, np.eye(4), path, links, plugins)
-    if root.find("world/include") is not None and not plugins:  # its own model is the ground
-        raise UserValueError(f"{path}: a world that includes its models. Give the file of the drone's own model.")
+    world = UserValueError(f"{path}: a world that includes its models. Give the file of the drone's own model.")
+    includes = root.find("world/include") is not None
     if drone is root and root.tag not in ("robot", "model"):
-        raise UserValueError(
-            f"{path}: XML with the root <{one_line(root.tag)}> is no URDF or SDF with a model. {READABLE}"
-        )
+        what = f"XML with the root <{one_line(root.tag)}> is no URDF or SDF with a model. {READABLE}"
+        raise world if includes else UserValueError(f"{path}: {what}")
     motors = sorted(
         (x for x in plugins if x.find("motorConstant") is not None), key=lambda x: _digits(x.findtext("motorNumber"))
     )
@@ -71,17 +71,20 @@ def read_xml(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
     if "" in rotors:
         which = shown(said[rotors.index("")])
         raise UserValueError(f"{path}: the linkName of a motor, {which}, is that of no link. Name its link.")
-    if others := [x for x in links if re.search(_GROUND, _last(x).lower()) and x not in rotors]:
-        raise UserValueError(f"{path}: it has {shown(_last(others[0]))}, and a drone here has rotors alone.")
+    if includes and not rotors:  # the world's own model is the ground
+        raise world
+    if others := [x for x in links if re.search(_OTHERS, _last(x).lower()) and x not in rotors]:
+        which = f"the link {shown(_last(others[0]))} looks like a wheel or a wing"
+        raise UserValueError(f"{path}: {which}, and a drone here has rotors alone. Take a multicopter.")
     lifts = [x for x in plugins if "liftdrag" in re.sub(r"\W|_", "", x.get("filename", "").lower())]
     blades = {*map(_last, rotors)}
     if any(_last(x.findtext("link_name")) not in blades for x in lifts):
         raise UserValueError(f"{path}: it has wings (LiftDrag), and a drone here has rotors alone. Take a multicopter.")
-    held = _check_fixed(drone, [_last(x) for x in rotors], path)
+    held = _held_joints(drone, [_last(x) for x in rotors], path)
     found = _body(links, rotors, bool(motors), held) | given
     _add_motors(found, motors, str(path), given)
     dropped = ("velocity_decay/linear", "velocity_decay/angular", "rollingMomentCoefficient")
-    unread = [x for x in dropped if any(_numbers(y.text, 1, str(path)).any() for y in root.iterfind(f".//{x}"))]
+    unread = [x for x in dropped if any((y.text or "").strip("0. \n\t") for y in root.iterfind(f".//{x}"))]
     if (said := root.find("properties")) is not None and root.tag == "robot":
         values = {name: presets.parse(text.encode(), name) for name, text in said.attrib.items()}
         numbers = Said(values, str(path), given)
@@ -90,7 +93,7 @@ def read_xml(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
     return str(path), "URDF" if root.tag == "robot" else "SDF", found, unread
 
 
-def _check_fixed(drone: ET.Element, rotors: Sequence[str], path: Path) -> list[str]:
+def _held_joints(drone: ET.Element, rotors: Sequence[str], path: Path) -> list[str]:
     """Refuse rotors that a joint turns against the body; the joints of other parts that move, which are read as fixed.
 
     A rotor spins by the first joint above it that turns about z. What is above all rotors moves the whole drone.
@@ -145,7 +148,7 @@ def _digits(name: str | None) -> list[int]:
 def _xml(path: Path) -> ET.Element:
     text = read_text(path)
     text = re.sub(r"{#.*?#}", "", text[max(text.find("<?xml"), 0) :], flags=re.DOTALL)  # comments of Jinja, of Gazebo
-    if chosen := re.search(r"{%-?\s*\w.*|{{.*", text):
+    if chosen := re.search(r"{%-?\s*\w.*|{{.*", re.sub("<!--.*?-->", "", text, flags=re.DOTALL)):
         raise UserValueError(f"{path}: a template of Jinja, with {shown(chosen[0][:40])}. Render it first.")
     if re.match(r"\s*<(!doctype )?html", text.lower()):
         raise UserValueError(f"{path}: this is a web page. Download the file itself, which GitHub calls raw.")
@@ -301,7 +304,7 @@ def _body(links: Links, rotors: Sequence[str], by_motors: bool, held: Sequence[s
     bare = [_last(x) for x, link in links.items() if _is_bare(link)]
     parts = ["all links together"] if sum(m > 0.0 for m, *_ in links.values()) > 1 else []
     parts += [f"as if these joints were fixed: {one_line(', '.join(held))}"] if held else []
-    note = "; ".join([*parts, f"without a mass: {one_line(', '.join(bare))}"] if bare else parts)
+    note = "; ".join([*parts, f"links without a mass: {one_line(', '.join(bare))}"] if bare else parts)
     found: Found = ({"mass": (mass, note)} if mass > 0.0 else {}) | diagonal(whole, "; ".join(parts))
     points = [x for x, (m, _, inertia, _) in links.items() if np.isnan(inertia).any() and m > 0.2 * mass]
     if points:
@@ -315,7 +318,7 @@ def _body(links: Links, rotors: Sequence[str], by_motors: bool, held: Sequence[s
     frames = np.array([links[x][1] for x in rotors]).round(12)
     up = np.array([links[x][3][0 if by_motors else 1] for x in rotors]).round(12)  # a motor pushes along the link's z
     if np.all(up[:, 2] < 0.3):  # as where a mesh was exported lying
-        found["rotor_direction"] = None, f"z of {rotors[0]} does not point up: give a direction for each rotor"
+        found["rotor_direction"] = None, f"the axis of {rotors[0]} does not point up: give a direction for each rotor"
         return found | {"rotor_positions": ((frames[:, :3, 3] - centre).round(12), f"of {', '.join(rotors)}")}
     return found | placed((frames[:, :3, 3] - centre).round(12), up, note=f"of {', '.join(rotors)}")
 

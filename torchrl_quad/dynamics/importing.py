@@ -93,7 +93,7 @@ def import_drone(path: str | Path, *, entry: str | None = None, **fields: Any) -
     """
     if not Path(path).is_file():  # a preset is no file
         read_text(Path(path))
-    if unknown := [x for x in fields if x not in FIELDS]:
+    if unknown := [x for x in fields if x not in (*FIELDS, "motor_command")]:
         raise UserValueError(f"{shown(unknown[0])} is no field of a drone. Choose from: {', '.join(FIELDS)}.")
     source, kind, found, unread = _read(Path(path), entry, fields)
     if not kind:
@@ -200,7 +200,7 @@ def _read(drone: Any, entry: str | None, fields: Mapping[str, Any]) -> tuple[str
         )
     if suffix in (".urdf", ".sdf", ".world", ".xml", ".jinja"):
         if entry is not None:
-            raise UserValueError(f"{drone}: has no drones by name. Leave out entry={shown(entry)}.")
+            raise UserValueError(f"{drone} holds one drone. Leave out entry={shown(entry)}.")
         return read_xml(Path(drone), usable(fields))
     if suffix == ".json":
         source, data = str(drone), read_json(Path(drone))

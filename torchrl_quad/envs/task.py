@@ -224,7 +224,8 @@ def check_task(env: Task, state: State) -> None:
         wanted = f"({n}, {columns or 'k'})" + ("" if dtype is None else f", {dtype}")
         hint = ""
         if isinstance(x, numbers.Real):
-            hint = f" Write torch.full_like(state['position'][:, :1], {x})."
+            kind_of = ", dtype=torch.bool" if dtype == torch.bool else ""
+            hint = f" Write torch.full_like(state['position'][:, :1], {x}{kind_of})." if columns else ""
         elif method.startswith("reward") and isinstance(x, Tensor):
             hint = " Keep the last dimension: norm(x) of envs.terms, or .sum(-1, keepdim=True)."
         hint = " Convert it: .to(self.dtype)." if is_right and dtype == env.dtype else hint
@@ -258,8 +259,13 @@ def check_task(env: Task, state: State) -> None:
         twice.append(env.initial_state(n))
         env.randomness.set_state(random)
     for key, x in twice[0].items():
-        again = not isinstance(x, Tensor) or torch.allclose(x, twice[1][key], equal_nan=True)
-        check(again, f"initial_state: {key!r} ignores the seed. Draw from self.uniform, .normal or .integers.")
+        other = twice[1].get(key)
+        same = isinstance(x, Tensor) and isinstance(other, Tensor) and x.shape == other.shape
+        again = not isinstance(x, Tensor) or (same and torch.allclose(x, other, equal_nan=True))
+        check(
+            again,
+            f"initial_state: {key!r} differs between calls with one seed. Draw from self.uniform, and count nothing.",
+        )
     taken = {"step", "action_queue", "collided", "drone", "scene"}
     starts = {key: type(x).__name__ for x in env.disturbances.values() for key in x.start(env.randomness, state)}
     taken |= {key for key in starts if isinstance(key, str)}

@@ -192,7 +192,11 @@ def load_track(track: str | Path | Mapping = "visfly", **settings: Any) -> dict[
     source, values = _read(track, settings)
     values = own_format(source, values)
     if unknown := [key for key in values if key not in _PARTS]:
-        known = "" if {"gates", "random"} & set(values) else " Of other formats load_track reads those that it names."
+        known = (
+            ""
+            if {"gates", "random"} & set(values)
+            else " The help of load_track lists the other formats that it reads."
+        )
         raise UserValueError(f"{source}: unknown key {shown(unknown[0])}. Allowed: {', '.join(_PARTS)}.{known}")
     found = {key: check_value(f"{source}: {key}", values[key], *_KEYS[key]) for key in _KEYS if key in values}
     found |= {key: values[key] for key in ("scene", "notes") if key in values}

@@ -143,22 +143,21 @@ def _add_signals(streams: dict[str, Stream], parameters: Mapping[str, float]) ->
         reached = np.concatenate([*pulses.values(), np.zeros(1)])
         least, most = float(np.nanmin(reached)), float(np.nanmax(reached))
         begun = float(np.nanmin(reached, where=reached > 0.0, initial=most))
-        is_dshot = parameters.get("DSHOT_CONFIG", 0.0) > 0.0 and most < 2048.0
+        dshot = (
+            most < 2048.0
+            and begun < 800.0
+            and (parameters.get("DSHOT_CONFIG", 0.0) > 0.0 or most > 1000.0 > begun + 300.0)
+        )
+        if least < 0.0:
+            why = f"{stem} runs from {least:g} to {most:g}: no pulses in us"
+            raise WrongMotors(f"{why}. Write the commands, 0 to 1, into a CSV, and give that.")
         for k, x in pulses.items():
             port, n = places[k]
-            usual = [parameters.get(f"PWM_{port}_{y}", parameters.get(f"PWM_{y}", -1.0)) for y in ("MIN", "MAX")]
-            own = [parameters.get(f"PWM_{port}_{y}{n}", -1.0) for y in ("MIN", "MAX")]
-            low, high = (
-                next((z for z in y if z > 0.0), at) for *y, at in zip(own, usual, (1000.0, 2000.0), strict=True)
-            )
-            unit = "pulses"
-            if least < 0.0:
-                why = f"{stem} runs from {least:g} to {most:g}: no pulses from {low:g} to {high:g} us"
-                raise WrongMotors(f"{why}. Write the commands, 0 to 1, into a CSV, and give that.")
-            if most <= 1.01:
-                unit, low, high = "shares", 0.0, 1.0
-            elif is_dshot or (1000.0 < most < 2048.0 and begun < 700.0):
-                unit, low, high = "DShot", 0.0, 1999.0
+            names = [[f"PWM_{port}_{end}{n}", f"PWM_{port}_{end}", f"PWM_{end}"] for end in ("MIN", "MAX")]
+            given = [[v for name in some if (v := parameters.get(name, -1.0)) > 0.0] for some in names]
+            low, high = ([*x, at][0] for x, at in zip(given, (1000.0, 2000.0), strict=True))
+            unit = "shares" if most <= 1.01 else "DShot" if dshot else "pulses"
+            low, high = {"shares": (0.0, 1.0), "DShot": (0.0, 1999.0)}.get(unit, (low, high))
             if high > low:
                 signals[f"actuator_outputs.signal[{k}]"] = np.where(x < low, 0.0, (x - low) / (high - low))
             said = f"{stem}, {unit} from {low:g} to {high:g}{' us' if unit == 'pulses' else ''}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import re
 from array import array
 from collections.abc import Mapping, Sequence
@@ -129,14 +130,18 @@ def _layout(bag: Any, topics: Mapping[str, str], columns: Asked, name: str) -> L
     named |= {second for first, second in RIVALS if first in named}
     rivals = {second: first for first, second in RIVALS}
     found, onboard = {}, BY_IMU
-    for kind, quantities in shipped("ros_messages.yaml").items():
-        topics_of_kind = sorted(topic for topic in topics if topics[topic] == kind)
+    kinds = shipped("ros_messages.yaml")
+    for asked_for, kind in itertools.product((False, True), kinds):  # what a drone shall do is read last
+        topics_of_kind = sorted(
+            x for x in topics if topics[x] == kind and (x in of or bool(_ASKED_FOR.search(x.lower())) == asked_for)
+        )
+        quantities = kinds[kind]
         for quantity, fields in quantities.items():
-            own, rival = [x for x in topics_of_kind if not _ASKED_FOR.search(x)], rivals.get(quantity)
+            own, rival = topics_of_kind, rivals.get(quantity)
             if of and quantity in pose:  # the caller means the pose of that topic only
                 own = [topic for topic in own if topic in of]
             if kind.endswith("/Actuators"):  # whose messages hold commands, or speeds
-                own = [topic for topic in topics_of_kind if _length(bag, topic, fields["of"], name)]
+                own = [topic for topic in own if _length(bag, topic, fields["of"], name)]
             if not own or {quantity, rival} & named or quantity in found or (rival in found and rival != "velocity"):
                 continue
             choice = named_alike(**fields | {"of": f"{own[0]}.{fields.get('of', '')}"})

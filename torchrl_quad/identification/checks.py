@@ -79,13 +79,11 @@ def check_velocity(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: f
     derived = smooth(slope(at["position"], dt), dt)
     speed = np.linalg.norm(derived[moving], axis=-1)
     place = signals["position"]
-    steps = np.diff(place.values, axis=0)
-    to_and_fro = (steps[1:] * steps[:-1]).sum() < -0.5 * (steps * steps).sum()
-    steps = np.linalg.norm(steps, axis=-1)
-    if to_and_fro and np.median(steps) > 0.05:
+    apart = [float(np.median(np.linalg.norm(place.values[n:] - place.values[:-n], axis=-1))) for n in range(1, 9)]
+    if apart[0] > 0.05 and min(apart[1:]) < 0.2 * apart[0]:
         raise NotOneDrone(
-            f"{place} jumps to and fro from row to row, by {np.median(steps):.3g} m in the median: are there rows of "
-            "several drones? Keep those of one."
+            f"{place} jumps to and fro from row to row, by {apart[0]:.3g} m in the median: are there rows of several "
+            "drones? Keep those of one."
         )
     if np.percentile(speed, 99) > 100.0:
         said = f"By {place} the drone flies at {np.percentile(speed, 99):.3g} m/s."
@@ -95,7 +93,7 @@ def check_velocity(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: f
         return
     given = smooth(at["velocity"], dt)
     fit, factor, _ = _compare(given, derived, dt, moving)
-    if not 0.6 < factor < 1.6 or (fit > 0.95 and not 0.8 < factor < 1.25):
+    if not 0.6 < factor < 1.6 or (fit > 0.99 and not 0.8 < factor < 1.25):
         size = "position" if factor < 1.0 else signal.field
         ratio = min(factor, 1.0 / factor)
         lengths = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
@@ -108,7 +106,7 @@ def check_velocity(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: f
                 f"the {size.partition('_')[0]} is in",
                 **{k: x for k, x in lengths.items() if 0.8 < ratio / x < 1.25},
             ),
-            _clock(factor),
+            *([] if 0.6 < factor < 1.6 else [_clock(factor)]),
             {"quantity": signal.field, "drop": True, "when": "the position is right"},
         )
     frames = ("world", "body") if signal.field == "velocity" else ("body", "world")
@@ -157,8 +155,10 @@ def check_specific_force(at: Mapping[str, Array], signals: Mapping[str, Signal],
         raise WrongUnit(f"{said}: it lacks gravity, which accelerometers measure.", drop)
     if fit >= -0.5:
         raise WrongFrame(f"{said} (correlation {fit:.2f}).", drop)
-    flips = sorted(([1, -1, -1], [1, 1, -1], [-1, -1, -1]), key=lambda flip: -(force * flip * due).sum())
-    remedies = [{"quantity": "acceleration", "factor": flip, "when": "the accelerometer counts so"} for flip in flips]
+    flips = {(1, -1, -1): "its axes point forward, right and down", (1, 1, -1): "its z axis points down"}
+    flips[-1, -1, -1] = "all its axes point the other way"
+    likely = sorted(flips, key=lambda flip: -(force * flip * due).sum())
+    remedies = [{"quantity": "acceleration", "factor": flip, "when": flips[flip]} for flip in likely]
     raise WrongFrame(f"{said} along the other direction (correlation {fit:.2f}).", _NED, *remedies, drop)
 
 
@@ -243,7 +243,7 @@ def check_rates(
     if not 1.0 / 3.0 < factor < 3.0 or (fit > 0.95 and not 0.7 < factor < 1.4):
         near = given.field == "euler" and 1.0 / 3.0 < factor * 180.0 / np.pi < 3.0
         degrees = in_units("euler", "the angles are in", degrees=np.pi / 180.0) if near else []
-        raise WrongUnit(f"{said} an unknown unit, or the clock is.", *degrees, _clock(factor), derive)
+        raise WrongUnit(f"{said} an unknown unit, or the clock is wrong.", *degrees, _clock(factor), derive)
     size = f", {factor:.2f} times as large" if not 0.8 < factor < 1.25 else ""
     return f"{signal} fits the attitude: correlation {fit:.2f}, {1000.0 * lag:+.0f} ms late{size}"
 

@@ -111,7 +111,7 @@ def _as_columns(quantity: object, names: object) -> Columns:
         )
     size = sizes.get(quantity, count)
     if len(set(names.names)) < count:
-        raise MissingColumns(f"{quantity} names a column twice: {', '.join(names.names)}. Name {count} columns.")
+        raise MissingColumns(f"{quantity} names a column twice: {', '.join(names.names)}. Name {count} different ones.")
     if count != size:
         raise MissingColumns(f"{quantity} takes {size} column(s), got {count}: {', '.join(names.names)}. Name each.")
     return names
@@ -184,8 +184,9 @@ def gather(layout: Layout, streams: Sequence[Stream], name: str) -> dict[str, Si
             )
         with np.errstate(over="ignore", invalid="ignore"):  # damage makes NaN and numbers of any size
             values = np.stack([np.asarray(stream.columns[column], float) for column in choice.names], -1)
+            values[np.isin(values, (-9999.0, -99999.0, 99999.0))] = np.nan  # as programs write what is missing
             values = (values - np.asarray(choice.offset, float)) * np.asarray(choice.scale, float)
-        values[~(np.abs(values) < LARGEST) | np.isin(values, (-9999.0, -99999.0, 99999.0))] = np.nan
+        values[~(np.abs(values) < LARGEST)] = np.nan
         setpoint = quantity.removeprefix("setpoint.")
         _, alike = QUANTITIES.get(quantity, (0, setpoint if setpoint in _TRANSLATED else None))
         if alike and not (alike == "motors" and layout.convention.motors is None):

@@ -82,10 +82,9 @@ def check_order(
 
     command = at["motor_command"][rows]
     spread, alike = command.std(0), np.ptp(command, 1).max() < 1e-6
-    if (
-        not spread.any() and slope(at["angular_velocity"], dt)[rows].std(0).max() > 1.0
-    ):  # which takes motors that differ
-        raise WrongMotors(f"In flight {signal} never change. Name the commands of the motors.")
+    turns = slope(at["angular_velocity"], dt)[rows].std(0).max() > 1.0  # which takes motors that differ
+    if turns and not spread.any():
+        raise WrongMotors(f"In flight {signal} never changes. Name the commands of the motors.")
     if spread.max() > 0.01 and (alike or spread.min() < 1e-3 * spread.max()):
         place = ("front left", "back left", "back right", "front right")[int(spread.argmin())]
         which = "are the same for all motors" if alike else f"do not change for the motor {place}"

@@ -35,7 +35,7 @@ _CUT = "Cut it into shorter logs."
 _NO_LOG = {  # by what it begins with
     rb"version https://git-lfs": "stands for a file that was not downloaded. Write: git lfs pull",
     rb"\s*<(!doctype )?html": "is a web page. Download the file itself, which GitHub calls raw.",
-    rb"\s*[\[{]": "is JSON, or like it. Export it as CSV.",
+    rb"\s*(\{|\[\s*[\[{\"\d-])": "is JSON, or like it. Export it as CSV.",
     rb"[\t -~]+\r[\t\r -~]+\Z": "ends its lines with carriage returns alone. Save it as CSV with line feeds.",
     rb"FMT, *128": "is the text of a dataflash log. Give its .bin.",
     rb"rosbag2_bagfile_information": "only describes a ROS bag. Give the folder that it lies in.",
@@ -79,7 +79,7 @@ def _read(file: io.BufferedReader[Any], name: str, columns: Asked, most: int) ->
     for magic, (reader, preset) in _READERS.items():
         if start.startswith(magic):
             if isinstance(columns, Mapping) and "time" in columns:
-                raise MissingColumns(f"{name}: columns names a time, and such a log has its own clock. Leave time out.")
+                raise MissingColumns(f"{name}: columns names a time, but such a log has its own clock. Leave time out.")
             layout = LAYOUTS[preset] if columns is None else choose(columns, LAYOUTS[preset])
             data = b"".join(_counted(iter(lambda: file.read(1 << 20), b""), name, most))
             streams, notes = reader(data, name)
@@ -169,15 +169,12 @@ def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
     values = dict.fromkeys(header, np.broadcast_to(np.nan, len(table)))  # the others are never read
     values |= dict(zip(place, table.T, strict=True))
     time = (values[clock] - np.asarray(layout.time.offset)) * np.asarray(layout.time.scale)
-    if np.isfinite(time).mean() < 0.9:
+    told = np.isfinite(table).any(1)  # other rows are empty
+    if not told.any() or np.isfinite(time[told]).mean() < 0.5:
         odd = next((k for k in range(len(samples)) if not np.isfinite(time[k])), None)
-        said = (
-            f", but {shown(_cells(samples[odd], mark, len(header), name, odd)[header.index(clock)])}"
-            if odd is not None
-            else ""
-        )
-        lost = f"in {np.mean(~np.isfinite(time)):.0%} of the rows"
-        raise UnreadableLog(f"{name}: the time in {clock} is no number{said} {lost}. Write it in seconds, as 1234.5.")
+        cell = "" if odd is None else _cells(samples[odd], mark, len(header), name, odd)[header.index(clock)]
+        said = f", but {shown(cell)}" if cell else " in most rows"
+        raise UnreadableLog(f"{name}: the time in {clock} is no number{said}. Write it in seconds, as 1234.5.")
     return [Stream("csv", time, values)], layout, notes
 
 

@@ -188,7 +188,10 @@ def _explained() -> Iterator[None]:
         lines = re.findall(r'File "(.+)", line (\d+), in', str(error))
         if isinstance(error, torch._dynamo.exc.Unsupported) and lines:
             where, why = ":".join(lines[-1]), str(error).partition("\n")[0]
-            told = "Branch on no data: write torch.where, and no .item() (docs/writing.md), or compile=false"
+            told = (
+                "Do not branch on data: use torch.where, and no .item()" if "ata-dependent" in why else "Leave it out"
+            )
+            told += ", or write compile=false"
             raise Refused(f"{where}: the compiler cannot follow this line: {why}. {told}.") from error
         if isinstance(error, MemoryError | torch.OutOfMemoryError) or "can't allocate memory" in str(error):
             why = "the memory is full. Lower num_envs, horizon, batch_size, or the size of the networks."

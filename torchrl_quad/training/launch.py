@@ -265,7 +265,8 @@ def own_folder(folder: Path, named: bool) -> Iterator[Path]:
                 stack.close()
                 if not named:
                     with contextlib.suppress(OSError):  # not empty: it has results
-                        path.rmdir()
+                        for empty in itertools.takewhile(Path.cwd().__ne__, (path, *path.parents)):
+                            empty.rmdir()
             return
 
 

@@ -61,6 +61,18 @@ def test_a_ulog_is_read_in_our_frames_with_what_leaves_for_the_motors(tmp_path):
     assert "actuator_outputs, pulses from 1000 to 2000 us" in str(log) and "1 gap(s) of up to 0.5" in str(log)
     messages["actuator_outputs"] = (t, {"output": ("float", np.maximum(1999.0 * signal, 9.0))})
     assert "actuator_outputs, DShot from 0 to 1999" in str(read_log(write_ulog(tmp_path / "old.ulg", messages, {})))
+    for scale, rest, said, parameters in (
+        (1999.0, 0.0, "DShot from 0 to 1999", {"DSHOT_CONFIG": 600.0}),
+        (
+            875.0,
+            1075.0,
+            "pulses from 1075 to 1950 us",
+            {"PWM_MAIN_MIN": 1075, "PWM_MAIN_MAX": 1950, "PWM_MAIN_MIN1": -1},
+        ),
+    ):
+        messages["actuator_outputs"] = (t, {"output": ("float", rest + scale * signal)})
+        log = read_log(write_ulog(tmp_path / "old.ulg", messages, parameters))
+        assert same(log, pieces=2) is None and said in str(log)
     del messages["actuator_outputs"]
     none = write_ulog(tmp_path / "none.ulg", messages, {})
     refuses("no motor_command or rotor_speed: looked for actuator_motors", read_log, none, error=MissingColumns)

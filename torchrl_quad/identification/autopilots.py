@@ -143,11 +143,9 @@ def _add_signals(streams: dict[str, Stream], parameters: Mapping[str, float]) ->
         reached = np.concatenate([*pulses.values(), np.zeros(1)])
         least, most = float(np.nanmin(reached)), float(np.nanmax(reached))
         begun = float(np.nanmin(reached, where=reached > 0.0, initial=most))
-        dshot = (
-            most < 2048.0
-            and begun < 800.0
-            and (parameters.get("DSHOT_CONFIG", 0.0) > 0.0 or most > 1000.0 > begun + 300.0)
-        )
+        rest = min((float(np.nanmin(x)) for x in pulses.values()), default=900.0)  # of pulses, at least PWM_DISARMED
+        set_up = parameters.get("DSHOT_CONFIG", 0.0) > 0.0 and min(rest, begun) < 800.0
+        dshot = most < 2048.0 and (set_up or (most > 1000.0 and begun < 700.0))
         if least < 0.0:
             why = f"{stem} runs from {least:g} to {most:g}: no pulses in us"
             raise WrongMotors(f"{why}. Write the commands, 0 to 1, into a CSV, and give that.")

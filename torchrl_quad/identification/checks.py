@@ -183,19 +183,20 @@ def check_rates(
     calm = f"{signal} was not checked: the flight turns too slowly ({turning:.2f} rad/s)"
     if turning < CALM / 5.0:
         return calm
-    trials = {name: (smooth(body_rates(h, dt), dt), smooth(gyro, dt)) for name, h in hypotheses.items()}
+    level = smooth(gyro, dt)
+    trials = {name: (smooth(body_rates(h, dt), dt), level) for name, h in hypotheses.items()}
     signs = {"if the gyro is of a body with y right and z down": FRD}
     signs |= {f"with {axis} the other way": 1.0 - 2.0 * np.eye(3)[k] for k, axis in enumerate(_AXES)}
-    trials |= {name: (right, smooth(gyro * sign, dt)) for name, sign in signs.items()}
+    trials |= {name: (right, level * sign) for name, sign in signs.items()}
     trials["in the world frame"] = (right, smooth(rotate_inverse(q, gyro), dt))
     fits = {name: _compare(b, a, dt, moving) for name, (a, b) in trials.items()}
     fit, factor, lag = fits["as given"]
     best = max(fits, key=lambda name: fits[name][0])
-    turn, apart = _turn(smooth(gyro, dt), right, dt, moving)
-    turned = _compare(smooth(gyro @ turn.T, dt), right, dt, moving)[0]
+    turn, apart = _turn(level, right, dt, moving)
+    turned = _compare(level @ turn.T, right, dt, moving)[0]
     told = f"{signal} correlates with the derivative of {given} by {fit:.2f} as given, and"
     if given.field == "euler":
-        other, how = _other_angles(logged, theirs, gyro, dt, moving)
+        other, how = _other_angles(logged, theirs, level, dt, moving)
         most = max(fits[best][0], turned)
         if other > max(0.9, most) and (other > most + SURE or (most < 0.99 and 1.0 - other < 0.3 * (1.0 - most))):
             raise WrongFrame(f"{told} by {other:.3f} if {how}. Give quaternions instead of angles.")
@@ -221,10 +222,9 @@ def check_rates(
     for unit, scale in (("degrees", np.pi / 180.0), ("milliradians", 1e-3)):
         if 1.0 / 3.0 < factor * scale < 3.0 and fit > 0.2:
             raise WrongUnit(f"{said} {unit}/s.", {"quantity": signal.field, "factor": scale})
-    derive: Remedy
     for k, axis in enumerate(_AXES):
-        one, other = (x[moving, k].std() for x in (smooth(gyro, dt), right))
-        along = _compare(smooth(gyro, dt)[:, [k]], right[:, [k]], dt, moving)[0]
+        one, other = (x[moving, k].std() for x in (level, right))
+        along = _compare(level[:, [k]], right[:, [k]], dt, moving)[0]
         counts = max(one, other) > max(3.0 * CALM, 0.3 * turning) and fit > 0.5
         if counts and (along < 0.3 or 10.0 * min(one, other) < max(one, other)):
             raise WrongFrame(
@@ -233,7 +233,7 @@ def check_rates(
             )
     if turning < CALM:
         return calm
-    derive = {"quantity": signal.field, "drop": True, "when": "the rates shall follow from the attitude"}
+    derive: Remedy = {"quantity": signal.field, "drop": True, "when": "the rates shall follow from the attitude"}
     if fit < 0.5:
         raise WrongFrame(
             f"{signal} does not follow {given}: their correlation is {fit:.2f} at best, also if the quaternion is "
@@ -248,8 +248,8 @@ def check_rates(
     return f"{signal} fits the attitude: correlation {fit:.2f}, {1000.0 * lag:+.0f} ms late{size}"
 
 
-def _other_angles(q: Array, theirs: Convention, gyro: Array, dt: float, moving: Mask) -> tuple[float, str]:
-    """How well a gyro follows roll, pitch and yaw that are read in the best of all other orders, and in which."""
+def _other_angles(q: Array, theirs: Convention, level: Array, dt: float, moving: Mask) -> tuple[float, str]:
+    """How well smoothed rates follow roll, pitch and yaw in the best of all other orders, and which that is."""
     w, x, y, z = q.T
     angles = [np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)), np.arcsin(np.clip(2 * (w * y - x * z), -1, 1))]
     angles = np.unwrap(np.stack([*angles, np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))], -1), axis=0)
@@ -265,7 +265,7 @@ def _other_angles(q: Array, theirs: Convention, gyro: Array, dt: float, moving: 
     fits = {}
     for name, turned in found.items():
         read = theirs.back({"quaternion": continuous(turned)})["quaternion"]
-        fits[name] = _compare(smooth(gyro, dt), smooth(body_rates(read, dt), dt), dt, moving)[0]
+        fits[name] = _compare(level, smooth(body_rates(read, dt), dt), dt, moving)[0]
     best = max(fits, key=lambda name: fits[name])
     return fits[best], best
 

@@ -137,14 +137,12 @@ def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
         _cells(row, mark, len(header), name, k)
     layout = match(header, name) if columns is None else choose(columns, _preset(header, name, columns))
     (clock,) = layout.time.names
+    if clock not in header and is_unnamed:
+        raise unnamed
     if clock not in header:
-        raise (
-            unnamed
-            if is_unnamed
-            else MissingColumns(
-                f"{name} has no column {clock} of the time. There are{listed(header, [clock, 'time', 'stamp'])}. "
-                'Name it: columns={"time": ...}.'
-            )
+        raise MissingColumns(
+            f"{name} has no column {clock} of the time. There are{listed(header, [clock, 'time', 'stamp'])}. "
+            'Name it: columns={"time": ...}.'
         )
     asked = layout.names | {clock}
     repeated = sorted(column for column, count in collections.Counter(header).items() if count > 1 and column in asked)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import sys
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -167,7 +168,8 @@ class Run:
                 print(f"Compiled in {time.perf_counter() - began:.0f} s.", flush=True)
         way = "inside" if self.task.flies_inside(self.actor) else "before"
         name = f"{self.cfg.algorithm} {self.cfg.task} {self.cfg.seed}, policy {way} the step"
-        bounds = {"total": self.total_steps, "initial": self.steps}
+        often = 0.1 if sys.stderr.isatty() else 30.0  # [s]: a file or a cluster's log keeps every line
+        bounds = {"total": self.total_steps, "initial": self.steps, "mininterval": often}
         bar = tqdm(**bounds, unit="step", unit_scale=True, desc=name, disable=rank() > 0)
         with logging_redirect_tqdm([torchrl_logger]), bar:  # TorchRL's lines go above the bar
             while self.goes_on:

@@ -1,4 +1,4 @@
-"""Make a drone of ours from a file of another project: URDF, SDF, or parameters in YAML, TOML or JSON.
+"""Make a drone of ours from a file of another project: URDF, SDF, MJCF, or parameters in YAML, TOML or JSON.
 
 python recipes/import_drone.py cf2x.urdf motor_time_constant=0.07
 

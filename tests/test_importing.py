@@ -95,6 +95,19 @@ ROTORS["rotor_configuration"] = {
 PLUS = {"rotor_positions": [(0.2, 0), (0, 0.2), (-0.2, 0), (0, -0.2)], "rotor_spin": [1, -1, 1, -1]}
 PLUS |= {"thrust_map": [8e-6, 0, 0], "yaw_torque_coefficient": 0.016, "inertia": [0.007, 0.008, 0.012]}
 REST = {"motor_time_constant": 0.03, "linear_drag": [0.1] * 3}
+SPINS = (-0.04, -0.04, 0.04, 0.04)
+SITES = "".join(f"<site name='s{i}' pos='{x} {y} 0.1'/>" for i, (x, y) in enumerate(CORNERS))
+MJCF = (
+    "<mujoco><size memory='9000G'/><default><geom material='m'/><general ctrllimited='true' ctrlrange='0 3'/></default>"
+    "<asset><mesh file='gone.obj' name='a'/><texture name='t' file='gone.png'/><material name='m' texture='t'/></asset>"
+    "<worldbody><geom type='plane' size='1 1 1'/><body name='x' euler='0 0 90' pos='0 0 3'><freejoint/>"
+    "<inertial pos='0 0 0' mass='1' diaginertia='0.01 0.02 0.025'/><geom type='mesh' mesh='a'/>"
+    f"<body><joint name='spin' axis='0 0 1'/><geom size='0.1' mass='1'/>{SITES}</body></body></worldbody><actuator>"
+    + "".join(
+        f"<general site='s{i}' gear='0 0 2 0 0 {x}' dyntype='filter' dynprm='0.05'/>" for i, x in enumerate(SPINS)
+    )
+    + "</actuator></mujoco>"
+)
 TILTING = "<joint name='k' type='fixed'><parent>arm</parent><child>x::rotor_0</child></joint>"
 TILTING += "<joint name='tilt' type='revolute'><parent>base_link</parent><child>arm</child><axis><xyz>0 1 0</xyz>"
 TILTING += "<limit><effort>1</effort></limit></axis></joint>"
@@ -136,6 +149,10 @@ HOVER, FAST = np.sqrt(9.81 * 2 / 4 / 1e-5), 2 * np.pi / 60  # of a rotor of the 
     ("x.yaml", json.dumps(ROTORS), REST | {"rotor_speed_max": 838}, PLUS | {"mass": 0.7}),
     ("x.toml", CRAZYFLOW, {}, {"linear_drag": [0.02, 0.02, 0.03], "motor_time_constant": [
      1 / (10 + 2e-4 * HOVER_RPM), 1 / (4e-4 * HOVER_RPM)]}),
+    ("x.xml", MJCF, {"rotor_speed_max": 1000, "linear_drag": [0.1] * 3}, {"mass": 2, "rotor_positions": CORNERS,
+     "inertia": [0.014, 0.024, 0.029], "rotor_spin": [-1, -1, 1, 1], "yaw_torque_coefficient": 0.02,
+     "thrust_map": [6e-6, 0, 0], "motor_time_constant": 0.05}),
+    ("x.xml", MJCF, {"thrust_map": [6e-6, 0, 0], "linear_drag": [0.1] * 3}, {"rotor_speed_max": 1000}),
 )  # fmt: skip
 def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_theirs(
     file, text, given, wanted, tmp_path
@@ -208,7 +225,22 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_th
     ("x.sdf", sdf("<include><uri>model://other</uri></include>"), "includes the model 'model://other': put it at "),
     ("x.urdf", "<!DOCTYPE x [<!ENTITY a 'b'>]><robot>&a;</robot>", "declares entities or a type"),
     ("x.sdf", sdf(FRAME.replace("0.02<", "much<")), "expected 1 number, got 'much'"),
-    ("x.xml", "<mujoco/>", "XML with the root <mujoco> is no URDF or SDF .* These can be read: URDF"),
+    ("x.xml", "<svg/>", "XML with the root <svg> is no URDF or SDF .* These can be read: URDF"),
+    ("x.xml", "<mujoco/>", "no body of it has a mass"),
+    ("x.xml", "<mujoco><worldbody><body/></worldbody></mujoco>", "no body of it has a mass"),
+    ("x.xml", "<mujoco><world/></mujoco>", "MuJoCo does not read it: .*unrecognized element"),
+    ("x.xml", MJCF, r"does not say thrust_map .* from ctrlrange, 6 N, once rotor_speed_max is known, rotor_speed_max"),
+    ("x.xml", MJCF.replace(" 2 0 0", " 0 0 0"), "rotor_positions .* no actuators push at sites, one for each rotor"),
+    ("x.xml", MJCF.replace("axis='0", "axis='9"), "the joint 'spin' turns rotors, and rotors here are fixed"),
+    ("x.xml", MJCF.replace("ctrlrange='0 3'/", "ctrlrange='0 3'/><replicate/"), "a drone needs no <replicate>"),
+    ("x.xml", "<mujoco><include file='x.xml'/></mujoco>", "x.xml', which is not there or includes itself"),
+    (
+        "x.xml",
+        MJCF.replace("</worldbody>", "<body name='y'><geom size='1'/><site name='t'/></body></worldbody>")
+        .replace("'s3'", "'t'", 2)
+        .replace("'t' pos", "'s3' pos"),
+        r"rotors push several drones, \['x', 'y'\]. Leave one",
+    ),
     ("x.json", "5", "this file is of no kind that is known. These can be read"),
     ("x.json", "[1]", "this file is of no kind that is known. These can be read"),
     (

@@ -21,8 +21,9 @@ Array = NDArray[np.float64]
 Found = dict[str, tuple[Any, str]]  # of a field: its value, None where there is none, and a note
 RPM = math.pi / 30.0  # [rad/s]
 READABLE = (
-    "These can be read: URDF, SDF, YAML of Flightmare, Agilicious, RotorS and OmniDrones, TOML of drone-models and "
-    "Crazyflow, JSON of VisFly, of l2f (rl-tools) and of RotorPy's quad_params, and our own YAML and TOML."
+    "These can be read: URDF, SDF, MJCF (.xml), YAML of Flightmare, Agilicious, RotorS and OmniDrones, TOML of "
+    "drone-models and Crazyflow, JSON of VisFly, of l2f (rl-tools) and of RotorPy's quad_params, and our own YAML and "
+    "TOML."
 )
 AXES = ("xx", "yy", "zz", "xy", "xz", "yz")
 GIVEN = "given, not in the file"

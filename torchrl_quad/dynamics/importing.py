@@ -77,10 +77,10 @@ def import_drone(path: str | Path, *, entry: str | None = None, **fields: Any) -
     """The YAML of a drone from a file of another project, with comments on all that the file does not say.
 
     It reads URDF, with the attributes of gym-pybullet-drones or the motors of RotorS; SDF, with Gazebo's motors or
-    without; YAML of Flightmare, Agilicious, RotorS and OmniDrones; TOML of drone-models and Crazyflow; JSON of VisFly,
-    of l2f, and of RotorPy's ``quad_params``. Frames become ours, and all links one rigid body with principal axes along
-    x, y and z. Drag that grows with rotor speed is that at hover. Only gains and limits of the rates are chosen where
-    nobody says them.
+    without; MJCF, whose actuators push at sites, through MuJoCo; YAML of Flightmare, Agilicious, RotorS and OmniDrones;
+    TOML of drone-models and Crazyflow; JSON of VisFly, of l2f, and of RotorPy's ``quad_params``. Frames become ours,
+    and all links one rigid body with principal axes along x, y and z. Drag that grows with rotor speed is that at
+    hover. Only gains and limits of the rates are chosen where nobody says them.
 
     Args:
         path: of that file.

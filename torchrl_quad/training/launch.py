@@ -50,10 +50,6 @@ class Refused(BaseException):
     """An error that its message explains: no traceback is needed. Hydra lets it pass, since it is no Exception."""
 
 
-class RefusedInSweep(Exception):
-    """The same in one run of a sweep: hydra reports it when the others have ended."""
-
-
 class CheckBeforeFolder(Callback):
     """Checks the configuration of a single run before hydra makes its folder; common.yaml names it."""
 
@@ -95,8 +91,8 @@ def recipe(config: str, **settings: Any) -> Callable[[Callable[[DictConfig], Non
                     flies.append(name)
                     main(cfg)
             except Refused as error:
-                if HydraConfig.get().mode == RunMode.MULTIRUN:
-                    raise RefusedInSweep(str(error)) from error
+                if HydraConfig.get().mode == RunMode.MULTIRUN:  # hydra reports it when the other runs have ended
+                    raise UserError(str(error)) from error
                 raise
 
         @functools.wraps(main)
@@ -110,7 +106,7 @@ def recipe(config: str, **settings: Any) -> Callable[[Callable[[DictConfig], Non
                 with _explained():
                     sys.argv[1:] = command_line(sys.argv[1:])
                 _run(job)
-            except (Refused, RefusedInSweep) as error:
+            except (Refused, UserError) as error:
                 _end(error, 2, full)
             except KeyboardInterrupt as error:
                 _end(error if str(error) else KeyboardInterrupt("Stopped. What is finished is kept."), 130, full)

@@ -111,11 +111,8 @@ def has_lost_its_way(rows: Sequence[Mapping[str, float]], patience: float | None
     Its return has also fallen by a tenth of the range: a race that just misses the last gate is not lost.
     """
     known = [row for row in rows if math.isfinite(row["eval/return"])]
-    if (
-        patience is None
-        or not known
-        or not 0.5 <= max(row["eval/solved"] for row in known) > 1.5 * rows[-1]["eval/solved"]
-    ):
+    best = max((row["eval/solved"] for row in known), default=0.0)
+    if patience is None or not 0.5 <= best > 1.5 * rows[-1]["eval/solved"]:
         return False
     returns = [row["eval/return"] for row in known]
     return not rows[-1]["eval/return"] >= max(returns) - 0.1 * (max(returns) - min(returns))

@@ -26,14 +26,8 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 import torchrl_quad
-from torchrl_quad import (
-    QuadrotorEnv,
-    VisitedStateBuffer,
-    audit_reward,
-    compare_gradients,
-    differentiable_rollout,
-    gradient_statistics,
-)
+from torchrl_quad import QuadrotorEnv, VisitedStateBuffer, differentiable_rollout
+from torchrl_quad.diagnostics import audit_reward, compare_gradients, gradient_statistics
 from torchrl_quad.errors import Diverged, UserError, UserValueError
 from torchrl_quad.files import replacing
 from torchrl_quad.objectives import PathwiseCriticLoss, PathwiseLoss
@@ -78,11 +72,9 @@ class Run:
     """A training run: ``for _ in run: ...``, with ``run.carry``, ``run.optimise(...)`` and ``run.record(...)`` in it.
 
     Every ``eval.interval`` iterations the run writes a row of metrics and a checkpoint, which holds all that it needs
-    to continue bit for bit, and the best policy so far: the one that solved most episodes in an evaluation, and of
-    those the one with the greatest return. At the end that policy flies from other starts. With ``eval.patience``,
-    episodes solved count to the nearest 2 %, and below a half not at all. A run that has lost its way then goes back to
-    its best policy, with its critics and optimisers; so does a run that has stalled, at a quarter of the actor's rate,
-    which doubles with each evaluation that rises again.
+    to continue bit for bit, and the best policy so far, by :func:`merit`, which flies from other starts at the end.
+    With ``eval.patience`` a run that has lost its way goes back to it, with its critics and optimisers; so does a run
+    that has stalled, at a quarter of the actor's rate, which doubles with each evaluation that rises again.
 
     The seconds are those of the loop, without set-up, compilation, evaluations and checkpoints.
 

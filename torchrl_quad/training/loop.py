@@ -26,7 +26,7 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 import torchrl_quad
-from torchrl_quad import QuadrotorEnv, VisitedStateBuffer, differentiable_rollout
+from torchrl_quad import VisitedStateBuffer, differentiable_rollout
 from torchrl_quad.diagnostics import audit_reward, compare_gradients, gradient_statistics
 from torchrl_quad.errors import Diverged, UserError, UserValueError
 from torchrl_quad.files import replacing
@@ -322,8 +322,6 @@ class Run:
 
     def _warn(self, crash: float) -> None:
         """Say why a run that has solved nothing may never learn: the traps of the reward, and the time limit."""
-        if not isinstance(self.task, QuadrotorEnv):
-            return
         with torch.random.fork_rng(), drawing_from(self.env, self.cfg.eval.seed):
             rollout, _ = differentiable_rollout(self.env, self.actor, self.carry, self.horizon)
             try:

@@ -208,27 +208,23 @@ def as_json(summary: Mapping[str, Any]) -> str:
     return json.dumps(content, indent=2, allow_nan=False) + "\n"
 
 
-def write_summary(path: Path, summary: Mapping[str, Any]) -> None:
-    """Write a summary as JSON."""
-    with replacing(path) as temporary:
-        temporary.write_text(as_json(summary))
-
-
 def title(summary: Mapping[str, Any]) -> str:
     """A summary in one line: "abpt on hovering, seed 0: 100 % of 256 episodes solved"."""
     solved = EPISODE_METRICS["solved"].format(summary["solved"])
     return f"{_name(summary)}: {solved} of {summary['episodes']} episodes solved"
 
 
-def print_summary(summary: Mapping[str, Any], metric_info: Mapping[str, Any], folder: Path) -> None:
-    """Print how well the policy flies, and where the results are."""
+def report(summary: Mapping[str, Any], metric_info: Mapping[str, Any], path: Path) -> None:
+    """Write a summary as JSON, and print how well the policy flies, and where the results are."""
+    with replacing(path) as temporary:
+        temporary.write_text(as_json(summary))
     print(f"\n{_name(summary)}, {summary['episodes']} fresh episodes:")
     for name, metric in metric_info.items():
         if not math.isnan(summary.get(name, math.nan)):
             print(f"  {metric.label:21s} {metric.format(summary[name])}")
     if "seconds" in summary:
         print(f"  {'training':22s}{summary['steps']:,} steps in {summary['seconds']:.1f} s")
-    print(f"  {'results in':22s}{folder}")
+    print(f"  {'results in':22s}{path.parent}")
 
 
 def _name(summary: Mapping[str, Any]) -> str:

@@ -56,10 +56,9 @@ from torchrl_quad.training.evaluation import (
     looks_ahead,
     merit,
     next_pace,
-    print_summary,
+    report,
     rounds,
     title,
-    write_summary,
 )
 from torchrl_quad.training.logs import Logs
 
@@ -350,8 +349,7 @@ class Run:
         summary, flight = final_evaluation(self.cfg, *best_policy(self.cfg, self.best, self.folder))
         summary |= {"steps": self.steps, "best_steps": self.best["steps"], "seconds": round(self.seconds, 2)}
         summary |= {"revision": self.revision}
-        write_summary(self.folder / "summary.json", summary)
-        print_summary(summary, self.task.metric_info, self.folder)
+        report(summary, self.task.metric_info, self.folder / "summary.json")
         figure, page = self.folder / "episode.pdf", self.folder / "flight.html"
         drawing.draw_flight(flight, self.folder / "flight.png", self.env, title(summary))
         drawing.publish_flight(flight, figure, page, self.env, title(summary))

@@ -5,7 +5,6 @@ python recipes/adapt.py checkpoint=outputs/.../checkpoint.pt 'logs=[flight1.csv]
 
 from pathlib import Path
 
-import torch
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_quad.adaptation import Adapter, write_report
@@ -22,7 +21,6 @@ from torchrl_quad.training.launch import recipe
 
 @recipe("adapt")
 def main(cfg: DictConfig) -> None:
-    torch.set_num_threads(cfg.threads)
     checkpoint = Path(cfg.checkpoint)
     trained, actor, normalizer = load_policy(checkpoint, trust=cfg.trust)
     settings = OmegaConf.to_container(cfg)

@@ -5,7 +5,6 @@ python recipes/evaluate.py checkpoint=outputs/.../checkpoint.pt
 
 from pathlib import Path
 
-import torch
 from omegaconf import DictConfig
 
 from torchrl_quad.training.building import build_env, task_of
@@ -16,7 +15,6 @@ from torchrl_quad.training.launch import recipe
 
 @recipe("evaluate")
 def main(cfg: DictConfig) -> None:
-    torch.set_num_threads(cfg.threads)
     trained, actor, normalizer = load_policy(Path(cfg.checkpoint), cfg.device, cfg.trust)
     summary, flight = final_evaluation(trained, actor, normalizer, cfg.episodes, cfg.seed)
     path, env = Path(cfg.checkpoint).with_name("evaluation"), build_env(trained, 1, 0)

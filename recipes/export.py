@@ -6,7 +6,6 @@ python recipes/export.py checkpoint=outputs/.../checkpoint.pt target=crazyflie  
 
 from pathlib import Path
 
-import torch
 from omegaconf import DictConfig
 
 from torchrl_quad.deploy import export_policy, load_bundle
@@ -21,7 +20,6 @@ from torchrl_quad.training.launch import recipe
 
 @recipe("export")
 def main(cfg: DictConfig) -> None:
-    torch.set_num_threads(cfg.threads)
     checkpoint = Path(cfg.checkpoint)
     trained, actor, normalizer = load_policy(checkpoint, trust=cfg.trust)
     env = build_env(trained, cfg.episodes, STARTS, normalizer=normalizer)

@@ -3,7 +3,6 @@
 python recipes/identify.py 'logs=[flight1.csv, flight2.csv]' drone=crazyflie mass=0.027
 """
 
-import torch
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_quad.deploy import frames
@@ -14,7 +13,6 @@ from torchrl_quad.training.launch import recipe
 
 @recipe("identify")
 def main(cfg: DictConfig) -> None:
-    torch.set_num_threads(cfg.threads)
     settings = OmegaConf.to_container(cfg)
     convention = settings["convention"] and frames.named(settings["convention"])
     reading = {"convention": convention, **(settings["reading"] or {})}

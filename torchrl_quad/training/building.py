@@ -68,7 +68,6 @@ def own_seed(cfg: DictConfig) -> int:
 
 def set_up(cfg: DictConfig) -> tuple[EnvBase, TensorDictModule]:
     """Seed everything, and build the environment and the policy; in all processes networks start equal."""
-    torch.set_num_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
     env = build_env(cfg, cfg.num_envs, own_seed(cfg), compile=cfg.compile)
     return env, make_policy(cfg, env)

@@ -89,6 +89,7 @@ def recipe(config: str, **settings: Any) -> Callable[[Callable[[DictConfig], Non
                         stack.enter_context(_resumable(folder, cfg))
                         take_over(cfg, folder)
                     flies.append(name)
+                    torch.set_num_threads(cfg.threads)
                     main(cfg)
             except Refused as error:
                 if HydraConfig.get().mode == RunMode.MULTIRUN:  # hydra reports it when the other runs have ended

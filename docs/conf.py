@@ -52,7 +52,7 @@ nitpick_ignore_regex = [
     (r"py:.*", r"(collections\.abc|pathlib|dataclasses|enum)\..*"),
     # In annotations that only keep the name, and those of modules without a page.
     (r"py:class", r"Arrays|Contract|Fields|Key|Length|ModelProto|Path|State|Tensor|TensorDict|TensorDictBase|Vector"),
-    (r"py:class", r"torchrl_quad\.(engine\.\w+|deploy\.(reading|contract)|identification\.parameters|options)\.\w+"),
+    (r"py:class", r"torchrl_quad\.(engine\.\w+|deploy\.(bundle|contract)|identification\.parameters|options)\.\w+"),
     (r"py:(exc|class|obj)", r"[A-Z][A-Za-z]*Error|ResetNeeded|NoFfmpeg|None|bool|dict|float|int|list|str|tuple|type"),
 ]
 

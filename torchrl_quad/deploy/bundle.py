@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import json
 import math
 from collections import Counter
 from collections.abc import Mapping
@@ -16,6 +18,7 @@ from torchrl_quad.deploy.contract import (
     MEASURED,
     Arrays,
     BrokenPolicy,
+    Contract,
     Fault,
     Fields,
     MissingQuantity,
@@ -23,14 +26,60 @@ from torchrl_quad.deploy.contract import (
     NotFinite,
     NotUnitQuaternion,
     StaleState,
+    TamperedBundle,
+    UnknownContract,
     WrongActions,
 )
-from torchrl_quad.deploy.reading import read
 from torchrl_quad.deploy.simulators.vehicle import Drone
-from torchrl_quad.errors import UserTypeError, UserValueError, shown
+from torchrl_quad.errors import UserTypeError, UserValueError, needing, one_line, shown
 
 START = np.array([1.0, 0.0, 0.0, 0.0])  # the quaternion that the first one of a flight takes its sign from
+AGAIN = "Export the policy again."
 MOST = 1e6  # of a number that says where a flight starts in the task
+
+
+class Graph:
+    """A graph of a bundle, ready to run.
+
+    Args:
+        path: where it came from.
+        content: ONNX.
+        about: what the contract says of it: ``reads`` and ``writes``.
+
+    Raises:
+        TamperedBundle: onnxruntime cannot read it.
+        ImportError: onnxruntime is missing.
+    """
+
+    def __init__(self, path: Path, content: bytes, about: Contract) -> None:
+        with needing("A bundle flies with onnxruntime: pip install onnxruntime"):
+            import onnxruntime
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = 4
+        try:
+            own = {"providers": ["CPUExecutionProvider"], "enable_fallback": 0}  # the fallback prints
+            self.session = onnxruntime.InferenceSession(content, options, **own)
+        except Exception as error:  # onnxruntime has a dozen kinds, with nothing else in common
+            raise TamperedBundle(f"{path}: onnxruntime cannot read it: {one_line(error)}. {AGAIN}") from error
+        self.name, self.reads = path.stem, [*about["reads"]]
+        self.writes = {name: tuple(x["shape"]) for name, x in about["writes"].items()}
+
+    def __call__(self, given: Arrays) -> Arrays:
+        """What the graph makes of arrays (n, ...), by name; what it does not read is ignored.
+
+        Raises:
+            BrokenPolicy: it fails, or answers in other shapes than the contract says.
+        """
+        try:
+            found: Any = self.session.run([*self.writes], {name: given[name] for name in self.reads})
+        except Exception as error:  # see above
+            raise BrokenPolicy(f"onnxruntime cannot run {self.name}.onnx: {one_line(error)}.") from error
+        count = len(given[self.reads[0]])
+        if [x.shape for x in found] != [(count, *shape) for shape in self.writes.values()]:
+            shapes = ", ".join(str(x.shape) for x in found)
+            raise BrokenPolicy(f"{self.name}.onnx answered arrays of the shapes {shapes}.")
+        return dict(zip(self.writes, found, strict=True))
 
 
 class Bundle:
@@ -62,7 +111,7 @@ class Bundle:
     def __init__(self, folder: Path, on_fault: Literal["raise", "hover"]) -> None:
         if on_fault not in ("raise", "hover"):
             raise UserValueError(f'on_fault must be "raise" or "hover", got {shown(on_fault)}.')
-        contract, self.graphs, self._vectors, self._starts = read(folder)
+        contract, self.graphs, self._vectors, self._starts = _read(folder)
         self.folder, self.contract, self.on_fault = folder, contract, on_fault
         self.faults: Counter[str] = Counter()
         self.last_fault: Fault | None = None
@@ -290,3 +339,42 @@ def load_bundle(folder: str | Path, on_fault: Literal["raise", "hover"] = "raise
         ImportError: onnxruntime or jsonschema is missing.
     """
     return Bundle(Path(folder), on_fault)
+
+
+def _read(folder: Path) -> tuple[Contract, dict[str, Graph], Arrays, Arrays]:
+    """The contract, the graphs, the vectors and the starts of a bundle, when every checksum fits."""
+    path = folder / "contract.json"
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"No bundle at {folder}: it has no contract.json. Export one: "
+            "python recipes/export.py checkpoint=.../checkpoint.pt"
+        )
+    try:
+        contract = json.loads(path.read_bytes())
+        version, fits = contract["version"], contracts.digest(contract) == contract["digest"]
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        why = f"it lacks {error}" if isinstance(error, KeyError) else one_line(error)
+        raise TamperedBundle(f"{path} is no contract of a policy, or is damaged: {why}. {AGAIN}") from error
+    package = contract.get("origin", {}).get("package", "another version")
+    written = f"It was written by {package}: use that one, or export again."
+    if version != contracts.VERSION:
+        reads = f"this torchrl_quad reads {contracts.VERSION}"
+        raise UnknownContract(f"{path} has version {shown(version)}, and {reads}. {written}")
+    changed = f"was changed after the export: its checksum does not fit. {AGAIN}"
+    if not fits:
+        raise TamperedBundle(f"{path} {changed}")
+    if said := contracts.problem(contract):
+        raise UnknownContract(f"{path}: {said}. This torchrl_quad cannot fly it. {written}")
+    content = {}
+    for name in contracts.files(contract):
+        try:
+            content[name] = (folder / name).read_bytes()
+        except OSError as error:
+            raise TamperedBundle(f"{folder / name} cannot be read: {error.strerror}. {AGAIN}") from error
+        if contracts.sha256(content[name]) != contract["sha256"][name]:
+            raise TamperedBundle(f"{folder / name} {changed}")
+    graphs = {
+        name: Graph(folder / f"{name}.onnx", content[f"{name}.onnx"], x) for name, x in contract["graphs"].items()
+    }
+    vectors, starts = (dict(np.load(io.BytesIO(content[name]))) for name in ("vectors.npz", "starts.npz"))
+    return contract, graphs, vectors, starts

@@ -173,18 +173,14 @@ class _Methods:
 
 
 class _Whole(nn.Module):
-    """Some methods together, as torch.export takes them: of tensors in the order of the names."""
+    """Some methods together, as torch.export takes them."""
 
-    def __init__(self, names: Iterable[str], methods: Iterable[Method]) -> None:
+    def __init__(self, methods: Iterable[Method]) -> None:
         super().__init__()
-        self.names, self.methods = [*names], [*methods]
+        self.methods = [*methods]
 
-    def found(self, *tensors: Tensor) -> Tensors:
-        given = dict(zip(self.names, tensors, strict=True))
-        return {name: x for method in self.methods for name, x in method(given).items()}
-
-    def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        return tuple(self.found(*tensors).values())
+    def forward(self, x: Tensors) -> Tensors:
+        return {name: found for method in self.methods for name, found in method(x).items()}
 
 
 def _exported(rules: _Methods) -> tuple[ExportedProgram, list[str]]:
@@ -202,14 +198,13 @@ def _exported(rules: _Methods) -> tuple[ExportedProgram, list[str]]:
 
 
 def _export(rules: _Methods, methods: list[Method]) -> tuple[ExportedProgram, list[str]]:
-    whole = _Whole(rules.inputs, methods)
-    batch, time = torch.export.Dim("batch"), torch.export.Dim("time")
-    shapes = [{0: batch, 1: time} if name in rules.flight else {0: batch} for name in rules.inputs]
-    program = torch.export.export(whole, (*rules.inputs.values(),), dynamic_shapes=((*shapes,),), strict=False)
+    whole, batch, time = _Whole(methods), torch.export.Dim("batch"), torch.export.Dim("time")
+    shapes = {name: {0: batch, 1: time} if name in rules.flight else {0: batch} for name in rules.inputs}
+    program = torch.export.export(whole, (rules.inputs,), dynamic_shapes=(shapes,), strict=False)
     for node in program.graph.nodes:
         if torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ()):
             raise UserValueError(RANDOM.format(node.target))
-    return program, [*whole.found(*rules.inputs.values())]
+    return program, [*whole(rules.inputs)]
 
 
 HOW = (

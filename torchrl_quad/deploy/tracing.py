@@ -262,14 +262,12 @@ class _Cut:
         self.source = {name: f"advance.{name}" for name in self.entries} | {"flight.next.done": "judge.terminated"}
         self.source |= {f"flight.next.{x.removeprefix('judge.')}": x for x in outputs if x.startswith("judge.")}
 
-    def _behind(self, output: str) -> set[str]:
-        """All values of the model that lead to an output, with its own."""
-        found, todo = set(), [self.outputs[output]]
-        while todo:
-            value = todo.pop()
-            if value not in found and value in self.maker:
-                todo += filter(None, self.maker[value].input)  # "" is an input that is left out
-            found.add(value)
+    def _behind(self, *outputs: str) -> set[str]:
+        """All values of the model that lead to outputs, with their own."""
+        found = {self.outputs[x] for x in outputs}
+        for node in reversed(self.nodes):  # which ONNX lists in the order in which they are computed
+            if not found.isdisjoint(node.output):
+                found.update(filter(None, node.input))  # "" is an input that is left out
         return found
 
     def _follows_from(self, *outputs: str) -> set[str]:
@@ -296,10 +294,9 @@ class _Cut:
                 f"export_policy: {task}: its observation cannot be exported: {why}. A drone has "
                 f"{', '.join(rules.known)}."
             )
-        unjudged = rules.unjudged
-        for name in [] if unjudged else [*(f"judge.{x}" for x in ENDS), "episode.solved", "episode.crash"]:
-            why = self._why_not(name)
-            unjudged = unjudged or (why and f"{name.partition('.')[2]}: {why}")
+        asked = [*(f"judge.{x}" for x in ENDS), "episode.solved", "episode.crash"]
+        reasons = (f"{name.partition('.')[2]}: {why}" for name in asked if (why := self._why_not(name)))
+        unjudged = rules.unjudged or next(reasons, None)
         judged = [] if unjudged else [x for x in self.outputs if x.startswith(("judge.", "episode."))]
         judged = [x for x in judged if not self._why_not(x)]
         needed = self._follows_from("observation", *judged)
@@ -324,7 +321,7 @@ class _Cut:
         """The ONNX with only these outputs. Values are numbered, so that the same rules give the same bytes."""
         from onnx import helper, numpy_helper
 
-        used = set().union(*(self._behind(output) for output in wanted))
+        used = self._behind(*wanted)
         inputs = {value: x for value, x in self.inputs.items() if value in used}
         before = [f"previous.{x}" for x in self.entries] if name == "advance" else self.entries
         called = dict(zip(self.entries, before, strict=True))  # in "advance" their outputs have the plain names

@@ -6,8 +6,6 @@ from what their mixers do with a torque, also read in the source; they have not 
 
 from __future__ import annotations
 
-from importlib import resources
-from string import Template
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +13,7 @@ import numpy as np
 from torchrl_quad.airframe import Array, quarters
 from torchrl_quad.deploy import frames
 from torchrl_quad.deploy.contract import AUTOPILOTS, Contract
+from torchrl_quad.deploy.network import fill_in
 from torchrl_quad.deploy.simulators.vehicle import Drone, PIDLoop
 
 AXES = ("roll", "pitch", "yaw")
@@ -113,8 +112,7 @@ def betaflight(contract: Contract) -> str:
         "reversed": "OFF" if front_left > 0.0 else "ON",
         "gains": "\n".join(lines),
     }
-    template = resources.files("torchrl_quad.deploy") / "templates" / "betaflight.txt"
-    return Template(template.read_text()).substitute(values)
+    return fill_in("betaflight.txt", values, ())
 
 
 def px4(contract: Contract) -> str:

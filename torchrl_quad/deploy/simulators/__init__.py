@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from torchrl_quad.deploy.contract import Contract
 from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Control, Drone
-from torchrl_quad.errors import MissingPackage, UserValueError, shown
+from torchrl_quad.errors import UserValueError, needing, shown
 
 # By name: the module here, its class, and what to install.
 SIMULATORS = {
@@ -64,6 +64,7 @@ class Simulator:
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
         """Continue with only these drones (n)."""
+        self.control.loop.keep(chosen)
 
 
 def simulator_class(name: str) -> type[Simulator]:
@@ -71,10 +72,8 @@ def simulator_class(name: str) -> type[Simulator]:
     if not isinstance(name, str) or name not in SIMULATORS:
         raise UserValueError(f"Unknown simulator {shown(name)}. Choose from: {', '.join(SIMULATORS)}.")
     module, cls, package = SIMULATORS[name]
-    try:
+    with needing(f"Flying in {name} needs {package}: pip install {package}"):
         return getattr(importlib.import_module(f"{__name__}.{module}"), cls)
-    except ImportError as error:
-        raise MissingPackage(f"Flying in {name} needs {package}: pip install {package} ({error})") from error
 
 
 def make_simulator(

@@ -71,8 +71,8 @@ class Crazyflow(Simulator):
             self.sim.step(1)
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
+        super().keep(chosen)
         self.flying = self.flying[chosen]
-        self.control.keep(chosen)
 
 
 def _parameters(drone: Drone, frame: frames.Convention) -> Fields:

@@ -152,9 +152,9 @@ class MuJoCo(Simulator):
             self.x, self.after = self.after[:, 0], x[:, None]
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
+        super().keep(chosen)
         self.x = self.x[chosen]
         self.scenes = [x for x, on in zip(self.scenes, chosen, strict=False) if on]
-        self.control.keep(chosen)
         self._allocate()
 
     def _allocate(self) -> None:

@@ -80,8 +80,8 @@ class RotorPy(Simulator):
         return self.vehicle.step(state, command, self.dt)
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
+        super().keep(chosen)
         self.now = [x for x, on in zip(self.now, chosen, strict=True) if on]
-        self.control.keep(chosen)
 
 
 def _squared(fields: Contract, speed: Array) -> Drone:

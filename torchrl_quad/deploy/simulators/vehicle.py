@@ -231,10 +231,6 @@ class Control:
     def _tilt(self, error: Array) -> Array:
         return _limited(self.gains["tilt_gain"] * error, self.max_rate[:2])
 
-    def keep(self, chosen: NDArray[np.bool_]) -> None:
-        """Continue with only these drones (n)."""
-        self.loop.keep(chosen)
-
 
 def _limited(x: Array, limit: Array) -> Array:
     return x / np.sqrt(1.0 + (x / limit) ** 2)

@@ -42,51 +42,47 @@ def fold(
         )
     if plain.low is not None:
         raise UserValueError(f"export_policy: actions must lie from -1 to 1, got {plain.low} to {plain.high}.")
-    *layers, last = zip(plain.weights[::2], plain.weights[1::2], strict=True)
-    activations, count = [*plain.lenses, *plain.activations], len(plain.lenses)
-    activated = [(*layer, activation) for layer, activation in zip(layers, activations, strict=False)]
-    seen = _layers(activated[:count]) if plain.sees else []
+    pairs, eyes = [*zip(plain.weights[::2], plain.weights[1::2], strict=True)], len(plain.lenses)
+    activations = [*plain.lenses, *plain.activations]
+    pairs = [*pairs[: len(activations)], pairs[-1]]  # between them stands the memory
+    layers = [_layer(*pair, x) for pair, x in zip(pairs, [*activations, nn.Tanh()], strict=True)]
+    layers[eyes] = _reading(layers[eyes], np.repeat(plain.scales, plain.widths), normalizer)
+    last = layers[-1]
+    layers[-1] = last._replace(weight=last.weight[: plain.size], bias=last.bias[: plain.size])  # the rest is noise's
+    layers = [Layer(weight.astype(np.float32), bias.astype(np.float32), x) for weight, bias, x in layers]
     memory = Memory(*(_numbers(x).astype(np.float32) for x in plain.weights[-6:-2])) if plain.memory else None
     height, width = image or (0, 0)
-    network = Network([], seen, (height, width), plain.nearest, memory, plain.head.max_loc)
-    if seen and (image is None or network.features != plain.widths[0] or seen[0].weight.shape[1] != 1):
+    network = Network(layers[eyes:], layers[:eyes], (height, width), plain.nearest, memory, plain.head.max_loc)
+    if eyes and (image is None or network.features != plain.widths[0] or layers[0].weight.shape[1] != 1):
         camera = "has no camera" if image is None else f"shows it {image[1]} x {image[0]} pixels"
         raise UserValueError(f"export_policy: the policy is for images of another size; the environment {camera}.")
-    columns, own = np.repeat(plain.scales, plain.widths), [*activated[count:], (*last, nn.Tanh())]
-    network = network._replace(layers=_layers(own, plain.size, columns, normalizer))
     if not all(np.isfinite(x).all() for x in network.weights()):
         raise UserValueError("export_policy: the weights of the policy, or its normaliser, are not finite.")
     return network
 
 
-def _layers(
-    parts: Any,
-    size: int | None = None,
-    columns: NDArray[np.float64] | None = None,
-    normalizer: ObservationNormalizer | None = None,
-) -> list[Layer]:
-    """Layers from weights, biases and activations: the first one's inputs times ``columns``, of which the last are
-    normalised, and of the last one's outputs the first ``size``, or all."""
-    weights, biases, activations = zip(*parts, strict=True)
-    for activation in activations:
-        if type(activation).__name__ not in ACTIVATIONS or repr(activation) != repr(type(activation)()):
-            raise UserValueError(
-                f"export_policy cannot write {activation} as ONNX and C. Choose from: {', '.join(ACTIVATIONS)}, with "
-                "their default arguments."
-            )
-    weights, biases = ([_numbers(x) for x in values] for values in (weights, biases))
-    if columns is not None:
-        weights[0] = weights[0] * columns
+def _layer(weight: Tensor, bias: Tensor, activation: nn.Module) -> Layer:
+    """A layer of a policy, in float64."""
+    name = type(activation).__name__
+    if name not in ACTIVATIONS or repr(activation) != repr(type(activation)()):
+        raise UserValueError(
+            f"export_policy cannot write {activation} as ONNX and C. Choose from: {', '.join(ACTIVATIONS)}, with their "
+            "default arguments."
+        )
+    return Layer(_numbers(weight), _numbers(bias), name)
+
+
+def _reading(layer: Layer, columns: NDArray[Any], normalizer: ObservationNormalizer | None) -> Layer:
+    """A layer that reads its inputs times ``columns``, of which the last are normalised."""
+    weight: Any = layer.weight * columns
+    bias: Any = layer.bias
     if normalizer is not None:
         loc, scale = _numbers(normalizer.loc), _numbers(normalizer.scale)
-        others, own = np.split(weights[0], [-len(loc)], 1)
+        others, own = np.split(weight, [-len(loc)], 1)
         own = own / scale
-        weights[0], biases[0] = np.concatenate((others, own), 1), biases[0] - own @ loc
-    weights[-1], biases[-1] = weights[-1][:size], biases[-1][:size]  # the rest is the noise's
-    names = [type(activation).__name__ for activation in activations]
-    weights, biases = ([x.astype(np.float32) for x in values] for values in (weights, biases))
-    return [Layer(*parts) for parts in zip(weights, biases, names, strict=True)]
+        weight, bias = np.concatenate((others, own), 1), bias - own @ loc
+    return layer._replace(weight=weight, bias=bias)
 
 
-def _numbers(x: Tensor) -> NDArray[np.float64]:
+def _numbers(x: Tensor) -> NDArray[Any]:
     return x.detach().double().cpu().numpy()

@@ -280,10 +280,9 @@ def table(path: Path, bundle: Bundle) -> str:
 def _rows(path: Path) -> list[dict[str, str]]:
     try:
         rows = read_rows(path)
-        whole = all(isinstance(row.get(name), str) for row in rows for name in (*KEY, *SHOWN))
-        why = "" if whole else f"a row lacks one of {', '.join(KEY)} or its results"
+        if not all(isinstance(row.get(name), str) for row in rows for name in (*KEY, *SHOWN)):
+            raise csv.Error(f"a row lacks one of {', '.join(KEY)} or its results")
     except (UnicodeDecodeError, csv.Error) as error:
-        rows, why = [], str(error)
-    if why:
-        raise UserValueError(f"{path} is no table of flights: {why}. Move it away, or choose another folder=...")
+        why = f"{path} is no table of flights: {error}. Move it away, or choose another folder=..."
+        raise UserValueError(why) from error
     return rows

@@ -111,7 +111,7 @@ class Bundle:
     def __init__(self, folder: Path, on_fault: Literal["raise", "hover"]) -> None:
         if on_fault not in ("raise", "hover"):
             raise UserValueError(f'on_fault must be "raise" or "hover", got {shown(on_fault)}.')
-        contract, self.graphs, self._vectors, self._starts = _read(folder)
+        contract, self.graphs, self._vectors, self._starts = _content(folder)
         self.folder, self.contract, self.on_fault = folder, contract, on_fault
         self.faults: Counter[str] = Counter()
         self.last_fault: Fault | None = None
@@ -341,7 +341,7 @@ def load_bundle(folder: str | Path, on_fault: Literal["raise", "hover"] = "raise
     return Bundle(Path(folder), on_fault)
 
 
-def _read(folder: Path) -> tuple[Contract, dict[str, Graph], Arrays, Arrays]:
+def _content(folder: Path) -> tuple[Contract, dict[str, Graph], Arrays, Arrays]:
     """The contract, the graphs, the vectors and the starts of a bundle, when every checksum fits."""
     path = folder / "contract.json"
     if not path.is_file():

@@ -12,7 +12,7 @@ from torch import nn
 from benchmarks.laps import basis, plan_lap, racing
 from torchrl_quad import MPC, ActionSequence, GeometricController, HoveringEnv, LandingEnv, RacingEnv, TrackingEnv
 from torchrl_quad.controllers import follow
-from torchrl_quad.controllers.mpc import feedback
+from torchrl_quad.controllers.mpc import WEIGHTS, feedback
 from torchrl_quad.dynamics import quaternion
 
 DOUBLE = {"dtype": torch.float64}
@@ -100,6 +100,13 @@ def test_neither_keeps_a_graph_and_the_planner_goes_on_from_its_last_plan():
     fresh = {**state, "step": 0 * state["step"]}
     assert torch.equal(mpc.begin(flight["plan"][:, 4], fresh, mpc.goal(state)[1]), mpc.goal(state)[1])
     assert not GeometricController(env)(flight[:, 3])["action"].requires_grad
+
+
+def test_each_weight_of_the_planner_changes_its_plan():
+    env = HoveringEnv(num_envs=1, random_start={"tilt": 0.5, "velocity": 1.0}, **DOUBLE)
+    td, settings = env.reset(), [{}, *({name: value + 5.0} for name, value in WEIGHTS.items())]
+    plain, *plans = (MPC(env, horizon=4, weights=changes)(td.copy())["plan"] for changes in settings)
+    assert all((plan - plain).abs().max() > 1e-4 for plan in plans)
 
 
 @pytest.mark.parametrize("delay", [0, 1, 3])

@@ -20,7 +20,7 @@ from torchrl_quad.options import between, checked
 # Of the squared residuals: each is the square of what one unit of it weighs, and half of it counts.
 WEIGHTS = {
     "position": 25.0,  # [1/m2]
-    "attitude": 0.25,  # of the quaternion
+    "attitude": 0.0,  # of the quaternion; thrust must follow the position in any case, and the heading is free
     "velocity": 2.25,  # [s2/m2]
     "angular_velocity": 0.01,  # [s2/rad2]
     "action": 0.01,
@@ -75,7 +75,8 @@ class MPC(Controller):
         self.horizon, self.iterations = horizon, iterations
         self.hover_speed, like = self.dynamics.controller.hover_speed, self.nominal.mass
         self.sizes = dict(self.dynamics.sizes)
-        costs = [like.new_full((k,), all_weights.get(name, 0.0)) for name, k in self.sizes.items()]
+        of_entries = {**all_weights, "quaternion": all_weights["attitude"]}
+        costs = [like.new_full((k,), of_entries.get(name, 0.0)) for name, k in self.sizes.items()]
         self.state_cost = torch.cat(costs).repeat(horizon, 1)
         self.state_cost[-1] *= all_weights["terminal"]
         self.action_cost = like.new_full((4,), all_weights["action"])

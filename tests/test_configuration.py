@@ -20,10 +20,7 @@ REFUSED = [  # of ABPT, unless a recipe is named
     ("actor.num_cells=64", r"actor.num_cells=64: it must be a list. .* or \[64\] for one layer"),
     ("actor.activation=functional", "actor.activation=functional: it must be 'CELU', 'ELU', .* or 'Tanh'"),
     ("actor.final_lr=0 actor.schedule=exponential", "actor.final_lr=0: it must be above 0 with schedule=exponential"),
-    (
-        "actor.schedule=step",
-        "actor.schedule=step: it must be 'constant', 'linear', 'exponential', 'cosine' or 'inverse_sqrt'",
-    ),
+    ("actor.schedule=step", "actor.schedule=step: it must be 'constant', 'linear', .* or 'inverse_sqrt'"),
     ("critic.updates=null", "critic.updates=null: it must be a whole number"),
     ("actor.scale_init=abc", "actor.scale_init=abc: it must be a number"),
     ("gamma=2", "gamma=2: it must be at most 1. .* 0.99 is usual"),

@@ -232,11 +232,7 @@ CHANGES = [  # of a contract whose checksums fit
     ("output.control", "velocity", "output.gains: 'tilt_gain' is a required property"),
     ("simulator.integrator", "rk9", "simulator.integrator: 'rk9' is not one of"),
     ("drone.thrust_map", [1e-9, 0, 0], "drone: to hover each rotor must give"),
-    (
-        "drone.rotor_positions",
-        [[0.1, 0.1]] * 4,
-        "drone.rotor_positions and rotor_spin cannot control roll and pitch",
-    ),
+    ("drone.rotor_positions", [[0.1, 0.1]] * 4, "drone.rotor_positions and rotor_spin cannot control roll and pitch"),
     ("plant", {"mass": 0}, "plant.mass: 0 is less than the minimum of 0.001"),
     ("plant", {"inertia": [1e-3, 1e-3, 3e-3]}, "plant.inertia .* kg m2: in a body none of the three exceeds"),
     ("plant", {"wings": 2}, "plant: .*'wings' was unexpected"),
@@ -266,9 +262,7 @@ def test_the_ranges_of_the_schema_lie_within_those_of_the_simulated_drones():
         assert least <= entry.get("minimum", entry.get("exclusiveMinimum")) < entry["maximum"] <= most, name
 
 
-def test_another_runtime_is_found_and_a_graph_that_it_cannot_read_or_that_leaves_limits_or_shape_is_refused(
-    copied,
-):
+def test_another_runtime_is_found_and_a_graph_that_it_cannot_read_or_that_leaves_limits_or_shape_is_refused(copied):
     bundle = load_bundle(copied[0])
     bundle._vectors["action"] += np.float32(1e-3)
     refuses("policy/policy.onnx: the policy differs by 0.001", bundle.check, error=WrongActions)

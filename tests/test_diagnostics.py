@@ -190,9 +190,7 @@ class EasyEnv(HoveringEnv):
 def test_a_success_that_is_always_true_and_a_large_observation_are_traps_and_a_crash_is_no_success():
     always, large = audit_reward(*fly(EasyEnv, 12, weights=NO_ATTITUDE), gamma=0.99).traps
     assert always.startswith("success is true in every step")
-    assert large.startswith(
-        "the observation has entries of more than a hundred in the mean: 13 (1e+04), 14 (1e+04), 15"
-    )
+    assert large.startswith("the observation has entries of more than a hundred in the mean: 13 (1e+04), 14 (1e+04)")
 
 
 def test_a_reward_without_any_gradient_and_starts_that_crash_at_once_are_traps():
@@ -209,11 +207,7 @@ NO_ATTITUDE = {"attitude": 0.0}
     ("racing", {"gate": 0.0, **NO_ATTITUDE}, "gate, target.* if a drone that waits .* waiting pays more than arriving"),
     (DoubtfulEnv, {"arrival": 1.0}, "success ends an episode and pays 1.1, .*: loitering pays more"),
     (DoubtfulEnv, {"near": 10.0, "width": 0.08}, "'near' is flat in .* of the flights, those in which it pays least"),
-    (
-        HoveringEnv,
-        {"survival": 0.0, **NO_ATTITUDE},
-        "as this policy flies .* must cost more than [0-9.]*, else dying is",
-    ),
+    (HoveringEnv, {"survival": 0.0, **NO_ATTITUDE}, "as this policy flies .* must cost more than [0-9.]*, else dying"),
     (CrashedEnv, {}, "100% of the episodes end in their first step: look at the start, is_crash and is_success"),
     (HoveringEnv, {}, "'attitude' is less than a thousandth of return and gradient"),
 )

@@ -207,10 +207,7 @@ def test_gradients_through_any_drone_agree_with_finite_differences():
     ({"randomize": {"any": {"weight": [1, 2]}}}, "any draws no 'weight'. Choose from: mass, thrust_to_weight, arm"),
     ({"randomize": {"any": {"mass": 1.0}}}, "mass must .* Give two numbers, low and high"),
     ({"randomize": {"any": {"thrust_to_weight": [0.9, 2]}}}, "two numbers, low and high, between 1.01 and 50; got"),
-    (
-        {"randomize": {"any": {"arm": [0.01, 0.1], "inertia": [0.01, 1]}}},
-        "not all possible: .* 'inertia' must be between",
-    ),
+    ({"randomize": {"any": {"arm": [0.01, 0.1], "inertia": [0.01, 1]}}}, "not all possible: .* 'inertia' must be"),
     ({"randomize": {"any": {"delay": [0, 2.5]}}}, "delay needs two whole numbers"),
     ({"randomize": {"any": {}, "mass": {"scale": [1, 2]}}}, "any draws the whole drone, and takes ranges, such as"),
     ({"randomize": {"any": {"delay": [0, 0]}}, "observe_last_action": True}, "without a delay there are none"),

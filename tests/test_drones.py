@@ -59,18 +59,12 @@ def test_a_drone_comes_from_a_file_or_a_mapping_as_well(tmp_path):
     ({"linear_drag": [0.0, -0.1, 0.0]}, r"mine.yaml: field 'linear_drag' must be between 0 and 100"),
     ({"rotor_spin": [1, 1, 0, -1]}, r"mine.yaml: field 'rotor_spin' must be \+1 or -1"),
     ({"inertia": [1e-3, 1e-3, 2.1e-3]}, r"inertia \[0.001, 0.001, 0.0021\] kg m2: in a body none .* exceeds the sum"),
-    (
-        {"inertia": [0.02, 0.02, 0.03]},
-        r"it is that of a ring of 0.255 m radius, and the farthest rotor is 0.075 m from",
-    ),
+    ({"inertia": [0.02, 0.02, 0.03]}, r"it is that of a ring of 0.255 m radius, and the farthest rotor is 0.075 m"),
     (
         {"rotor_positions": [[5.3, 5.3], [-5.3, 5.3], [-5.3, -5.3], [5.3, -5.3]]},
         r"a ring of 0.0664 m radius, and the farthest rotor is 7.5 m from .*; mass is in kg, rotor_positions in m",
     ),
-    (
-        {"thrust_map": [-1e-6, 5e-3, 0.0]},
-        r"must rise .* is \[0.0046\] at rotor_speed_min and \[-0.002\] at rotor_speed_max",
-    ),
+    ({"thrust_map": [-1e-6, 5e-3, 0.0]}, r"must rise .* is \[0.0046\] at rotor_speed_min and \[-0.002\] at"),
     ({"thrust_map": [0.0, 1e-3, 0.0]}, r"thrust_map must bend, .* k2 is \[0.0\]. Write 3.1e-10, which"),
     ({"mass": "1:59:59"}, r"mine.yaml: field 'mass' is not a number or a list of numbers: '1:59:59'"),
     ({"thrust_map": [4e-7, -5e-3, 0.0]}, r"thrust_map must rise with rotor speed"),
@@ -92,10 +86,7 @@ def test_what_is_no_drone_is_refused_by_name(tmp_path):
         (lambda: load_drone("visflu"), f"Unknown drone 'visflu'. Choose from: {', '.join(available_drones())}"),
         (lambda: load_drone(tmp_path / "list.yaml"), "expected a mapping of names to values, got list"),
         (lambda: load_drone(tmp_path / "bad.yaml"), "bad.yaml: not a YAML file"),
-        (
-            lambda: FlightController(drone.replace(rotor_spin=[1.0] * 4)),
-            "its 4 rotors cannot control yaw independently",
-        ),
+        (lambda: FlightController(drone.replace(rotor_spin=[1.0] * 4)), "its 4 rotors cannot control yaw"),
         (lambda: drone.replace(weight=1.0), "QuadrotorParams has no field 'weight'. Choose from: mass,"),
         (lambda: drone.replace(mass=torch.ones(5)), r"field 'mass' has shape \(5,\); it must be \(1,\) for one drone"),
         (lambda: load_drone("visfly", torch.int64), "dtype must be torch.float32 or torch.float64"),
@@ -136,10 +127,7 @@ QUICK = {**VISFLY, "motor_time_constant": 0.005, "rate_damping": VISFLY["inertia
 
 @cases(
     (IRIS, r"about roll and pitch overshoots by 25% \(in continuous time by 7%\) and asks at full rate .* torque"),
-    (
-        {**IRIS, "rate_gain": [75.0] * 3, "max_body_rate": [8.0, 8.0, 0.1]},
-        r"about roll and pitch asks .* 10.2 times the torque",
-    ),
+    ({**IRIS, "rate_gain": [75.0] * 3, "max_body_rate": [8, 8, 0.1]}, r"roll and pitch asks .* 10.2 times the torque"),
     ({**QUICK, "rate_gain": [365.0, 365.0, 50.0]}, r"about roll and pitch overshoots by 100%"),
     ({**QUICK, "rate_gain": [20.0, 20.0, 730.0]}, r"about yaw is unstable, .* Write rate_gain: \[20.0, 20.0, "),
     ({**QUICK, "rate_damping": [0.03] * 3}, r"about roll and pitch and yaw is unstable"),
@@ -175,9 +163,7 @@ def test_suggested_gains_are_well_damped_and_ask_no_more_of_the_rotors_than_they
 
 
 def test_a_command_beyond_the_reach_of_the_rotors_is_warned_of_and_the_advice_flies_without():
-    with pytest.warns(
-        DroneWarning, match="commands max_thrust_to_weight=6, and the rotors reach 4.446 times"
-    ) as warned:
+    with pytest.warns(DroneWarning, match="commands max_thrust_to_weight=6, and the rotors reach 4.446") as warned:
         HoveringEnv(num_envs=1, drone={**VISFLY, "max_thrust_to_weight": 6.0})
     most = float(str(warned[0].message).rpartition(" ")[2].removesuffix("."))
     HoveringEnv(num_envs=1, drone={**VISFLY, "max_thrust_to_weight": most})
@@ -191,9 +177,7 @@ def test_drones_drawn_have_bodies_and_none_has_an_unstable_rate_loop():
     refuses("randomize: a drawn drone: in steps of dt=0.005 s .* unstable", HoveringEnv, num_envs=1, randomize=unstable)
     HoveringEnv(num_envs=1, randomize=unstable, dt=0.001)
     lighter = env.params.replace(inertia=env.params.inertia * 0.1)
-    refuses(
-        r"unstable with an inertia of [^m]* kg m2, since its gains are for [^a-z]*\. Choose", env.set_params, lighter
-    )
+    refuses(r"unstable with an inertia of [^m]* kg m2, since its gains are for [^a-z]*\.", env.set_params, lighter)
     stronger = {"thrust_map": {"scale": [1.0, 10.0]}, "rotor_positions": {"scale": [0.5, 2.0]}}
     refuses(r"rotors that give \[20.0, 20.0, 10.0\] times the torque", HoveringEnv, num_envs=1, randomize=stronger)
 

@@ -97,16 +97,8 @@ def turned(table, x, y):
 def y_up(t):
     """Position, velocity and attitude in a world whose y axis points up."""
     x, y, z, w = (H * t[n] for n in TURN)
-    return {
-        "py": t["pz"],
-        "pz": -t["py"],
-        "vy": t["vz"],
-        "vz": -t["vy"],
-        "qx": x - w,
-        "qy": y + z,
-        "qz": z - y,
-        "qw": w + x,
-    }
+    moved = {"py": t["pz"], "pz": -t["py"], "vy": t["vz"], "vz": -t["vy"]}
+    return moved | {"qx": x - w, "qy": y + z, "qz": z - y, "qw": w + x}
 
 
 def in_body(t):
@@ -128,9 +120,7 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
     "z down": (lambda t: scaled(t, ("pz", "vz"), -1), "WrongFrame", "z points down. If only z.*scale=.1.0, 1.0, -1"),
     "body with z down": (
         lambda t: {"qx": t["qw"], "qy": t["qz"], "qz": -t["qy"], "qw": -t["qx"]} | scaled(t, GYRO[1:] + FORCE[1:], -1),
-        "WrongFrame",
-        "does not thrust along its z axis.*y right and z down",
-    ),
+        "WrongFrame", "does not thrust along its z axis.*y right and z down"),
     "y up": (y_up, "WrongFrame", "does not thrust along its z axis: the cosine between them is -?0.0"),
     "velocity of the body": (in_body, "WrongFrame", "body frame .correlation 1.000. and not in the world"),
     "velocity without z": (lambda t: {"vz": 0.0 * t["vz"]}, "WrongFrame", "vz. does not follow .* 0.00 along x, y, z"),
@@ -139,45 +129,25 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
     "accelerometer in g": (lambda t: scaled(t, FORCE, 1 / G), "WrongUnit", "in g, write"),
     "accelerometer in mg": (lambda t: scaled(t, FORCE, 1e3 / G), "WrongUnit", "in thousandths of g, write"),
     "motors in percent": (lambda t: scaled(t, MOTORS, 100.0), "WrongUnit", "percents, write"),
-    "motors in DShot": (
-        lambda t: {n: 2000.0 * np.maximum(t[n], 30.0) for n in MOTORS},
-        "WrongUnit",
-        "DShot commands up to 2000, write",
-    ),
+    "motors in DShot": (lambda t: {n: 2000.0 * np.maximum(t[n], 30.0) for n in MOTORS}, "WrongUnit",
+        "DShot commands up to 2000, write"),
     "motors in counts": (lambda t: scaled(t, MOTORS, 65535.0), "WrongUnit", "counts of 16 bits, write"),
     "motors beyond full": (lambda t: scaled(t, MOTORS, 2.0), "WrongUnit", "full command. It is like neither"),
     "motors are thrusts": (lambda t: scaled(t, MOTORS, 2.75), "WrongUnit", "full command. It is like neither"),
     "motors hardly run": (lambda t: scaled(t, MOTORS, 0.03), "WrongUnit", "no drone flies with so little"),
-    "motors turn to and fro": (
-        lambda t: {n: 65535 * 700 * np.sin(9 * t["t"] + t[n]) for n in MOTORS},
-        "WrongUnit",
-        "like neither",
-    ),
-    "motors are speeds": (
-        lambda t: {n: 65535 * 3e-2 * (-1) ** k * t[n] for k, n in enumerate(MOTORS)},
-        "WrongUnit",
-        "in rad/s, wr",
-    ),
-    "one motor stands": (
-        lambda t: scaled(t, MOTORS[2:3], 0.0),
-        "WrongMotors",
-        "not change for the motor back left. Name",
-    ),
-    "motors in another order": (
-        lambda t: dict(zip(MOTORS, (t[MOTORS[k]] for k in (3, 1, 2, 0)), strict=True)),
-        "WrongMotors",
-        "another",
-    ),
+    "motors turn to and fro": (lambda t: {n: 65535 * 700 * np.sin(9 * t["t"] + t[n]) for n in MOTORS}, "WrongUnit",
+        "like neither"),
+    "motors are speeds": (lambda t: {n: 65535 * 3e-2 * (-1) ** k * t[n] for k, n in enumerate(MOTORS)}, "WrongUnit",
+        "in rad/s, wr"),
+    "one motor stands": (lambda t: scaled(t, MOTORS[2:3], 0.0), "WrongMotors",
+        "not change for the motor back left. Name"),
+    "motors in another order": (lambda t: dict(zip(MOTORS, (t[MOTORS[k]] for k in (3, 1, 2, 0)), strict=True)),
+        "WrongMotors", "another"),
     "accelerometer without gravity": (
-        lambda t: {n: np.gradient(t[v], t["t"]) / G for n, v in zip(FORCE, SPEED, strict=True)},
-        "WrongUnit",
-        'lacks gravity.*Write columns={"acceleration": None}.$',
-    ),
-    "two faults at once": (
-        lambda t: scaled(t, GYRO, 180 / np.pi) | scaled(t, FORCE, 1 / G),
-        "WrongUnit",
-        "imu_gyro_x.*imu_acc_x",
-    ),
+        lambda t: {n: np.gradient(t[v], t["t"]) / G for n, v in zip(FORCE, SPEED, strict=True)}, "WrongUnit",
+        'lacks gravity.*Write columns={"acceleration": None}.$'),
+    "two faults at once": (lambda t: scaled(t, GYRO, 180 / np.pi) | scaled(t, FORCE, 1 / G), "WrongUnit",
+        "imu_gyro_x.*imu_acc_x"),
     "roll rate mirrored": (lambda t: scaled(t, GYRO[:1], -1), "WrongFrame", "with roll the other way. Write .*-1.0, 1"),
     "pitch rate mirrored": (lambda t: scaled(t, GYRO[1:2], -1), "WrongFrame", "with pitch the other way. Write "),
     "centimetres": (lambda t: scaled(t, PLACE + SPEED, 1e2), "WrongUnit", "px.*centimetres.*0.01.*vx.*0.01"),
@@ -186,22 +156,13 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
     "km/h": (lambda t: scaled(t, SPEED, 3.6), "WrongUnit", "3.* times .*in km/h, write .*0.277"),
     "millivolts": (lambda t: {"pwr_pm_vbat": 1e3 * t["pwr_pm_vbat"]}, "WrongUnit", "in the median.*millivolts, write"),
     "centivolts": (lambda t: {"pwr_pm_vbat": 1e2 * t["pwr_pm_vbat"]}, "WrongUnit", "in centivolts, write"),
-    "motors in pulses": (
-        lambda t: {n: np.where(t["t"] < 0.5, 0.0, 1000.0 + t[n] / 65.535) * 65535.0 for n in MOTORS},
-        "WrongUnit",
-        "runs from 0 .*pulses from 1000 to 2000 us, write",
-    ),
+    "motors in pulses": (lambda t: {n: np.where(t["t"] < 0.5, 0.0, 1000.0 + t[n] / 65.535) * 65535.0 for n in MOTORS},
+        "WrongUnit", "runs from 0 .*pulses from 1000 to 2000 us, write"),
     "world turned": (lambda t: turned(t, (0.0, -1.0), (1.0, 0.0)), "WrongFrame", "turned by 8. degrees about z. Bring"),
-    "world mirrored": (
-        lambda t: turned(t, (1.0, 0.0), (0.0, -1.0)),
-        "WrongFrame",
-        "of position and .* is mirrored in y",
-    ),
-    "attitude of another time": (
-        lambda t: {n: np.roll(t[n], 150) for n in TURN + GYRO},
-        "WrongFrame",
-        "leans another way .*up to 0.3 s late. Name",
-    ),
+    "world mirrored": (lambda t: turned(t, (1.0, 0.0), (0.0, -1.0)), "WrongFrame",
+        "of position and .* is mirrored in y"),
+    "attitude of another time": (lambda t: {n: np.roll(t[n], 150) for n in TURN + GYRO}, "WrongFrame",
+        "leans another way .*up to 0.3 s late. Name"),
     "clock in ms": (lambda t: scaled(t, ["t"], 1e3), "WrongUnit", "milliseconds, write"),
     "clock in ns": (lambda t: {"t": 1e9 * t["t"]}, "WrongUnit", "nanoseconds, write"),
     "clock jumps back": (lambda t: {"t": t["t"] - (t["t"] > 5.0)}, "ClockJumpsBack", "from 5 to 4.0.* at sample"),
@@ -210,7 +171,7 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
     "motors off": (lambda t: scaled(t, MOTORS, 0.0), "NoFlight", "motor command is below"),
     "never in the air": (lambda t: {"pz": 0 * t["pz"], "vz": 0 * t["vz"]}, "NoFlight", "rises 0.000 m at most"),
     "gaps": (lambda t: {"px": np.where(t["t"] % 0.4 < 0.2, t["px"], np.nan)}, "GapsTooLarge", "Write max_gap=0.25.$"),
-}
+}  # fmt: skip
 
 
 HOPELESS = {"motors beyond full", "motors are thrusts", "motors hardly run", "motors turn to and fro", "no numbers"}

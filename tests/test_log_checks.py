@@ -30,25 +30,16 @@ aviation = {name: ned(TRUE)[name] for name in ("angular_velocity", "acceleration
 dead_yaw = TRUE["angular_velocity"] * (1.0, 1.0, 0.0)
 other_row = TRUE["position"] + (np.arange(len(T)) % 2)[:, None] * (5.0, 2.0, 0.0)
 FAULTS = {  # what changes, how it is named, and what the message says
-    "tracker turned": (
-        own_table(T, quaternion=turned((0, 0, 0.8))),
-        TABLE,
-        "turned by 46 degrees about .0.0, 0.0, 1.0. a",
-    ),
+    "tracker turned": (own_table(T, quaternion=turned((0, 0, 0.8))), TABLE,
+        "turned by 46 degrees about .0.0, 0.0, 1.0. a"),
     "tracker pitched": (own_table(T, quaternion=turned((0, 0.5, 0))), TABLE, "turned by 29 degrees about .-?0.0, 1.0"),
-    "aviation": (
-        own_table(T, **aviation) | euler(np.degrees(AVIATION.as_euler("ZYX")[:, ::-1])),
-        EULER,
-        "in degrees and .* yaw counts from north",
-    ),
+    "aviation": (own_table(T, **aviation) | euler(np.degrees(AVIATION.as_euler("ZYX")[:, ::-1])), EULER,
+        "in degrees and .* yaw counts from north"),
     "x first": (own_table(T) | euler(ATTITUDE.as_euler("XYZ")), EULER, "about the body's x, then y, then z. Give quat"),
     "z, x, y": (own_table(T) | euler(ATTITUDE.as_euler("ZXY")[:, [1, 2, 0]]), EULER, "the body's z, then x, then y"),
     "rotation vector": (own_table(T) | euler(ATTITUDE.as_rotvec()), EULER, "if the angles are a rotation vector"),
-    "no yaw": (
-        own_table(T) | euler(ATTITUDE.as_euler("ZYX")[:, ::-1] * (1, 1, 0)),
-        EULER,
-        "About yaw .* does not turn",
-    ),
+    "no yaw": (own_table(T) | euler(ATTITUDE.as_euler("ZYX")[:, ::-1] * (1, 1, 0)), EULER,
+        "About yaw .* does not turn"),
     "dead axis": (own_table(T, angular_velocity=dead_yaw), TABLE, "About yaw .* does not turn as quaternion"),
     "stands still": (own_table(T, **STILL), TABLE, "leans to and fro by 17 degrees, .* hardly accelerates"),
     "two drones": (own_table(T, position=other_row), TABLE, "jumps to and fro from row to row, by 5.39 m"),
@@ -56,17 +47,11 @@ FAULTS = {  # what changes, how it is named, and what the message says
     "half speed": (own_table(T) | {"t": 2.0 * T}, TABLE, "is 2 times the derivative .* time does not count seconds"),
     "minutes": (own_table(T) | {"t": T / 60.0}, TABLE, "time does not count seconds.*scale=60"),
     "samples": (own_table(T) | {"t": np.arange(len(T))}, TABLE, "counts samples at 100 Hz"),
-    "constant motors": (
-        own_table(T, motor_command=np.full((len(T), 4), 0.5)),
-        TABLE,
-        "never changes. Name the commands",
-    ),
-    "a motor twice": (
-        own_table(T),
-        TABLE | {"motor_command": ("u0", "u1", "u2", "u2")},
-        "names a column twice: u0, u1",
-    ),
-}
+    "constant motors": (own_table(T, motor_command=np.full((len(T), 4), 0.5)), TABLE,
+        "never changes. Name the commands"),
+    "a motor twice": (own_table(T), TABLE | {"motor_command": ("u0", "u1", "u2", "u2")},
+        "names a column twice: u0, u1"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("fault", FAULTS)

@@ -63,12 +63,7 @@ def test_a_ulog_is_read_in_our_frames_with_what_leaves_for_the_motors(tmp_path):
     assert "actuator_outputs, DShot from 0 to 1999" in str(read_log(write_ulog(tmp_path / "old.ulg", messages, {})))
     for scale, rest, said, parameters in (
         (1999.0, 0.0, "DShot from 0 to 1999", {"DSHOT_CONFIG": 600.0}),
-        (
-            875.0,
-            1075.0,
-            "pulses from 1075 to 1950 us",
-            {"PWM_MAIN_MIN": 1075, "PWM_MAIN_MAX": 1950, "PWM_MAIN_MIN1": -1},
-        ),
+        (875.0, 1075.0, "pulses from 1075 to 1950", {"PWM_MAIN_MIN": 1075, "PWM_MAIN_MAX": 1950, "PWM_MAIN_MIN1": -1}),
     ):
         messages["actuator_outputs"] = (t, {"output": ("float", rest + scale * signal)})
         log = read_log(write_ulog(tmp_path / "old.ulg", messages, parameters))

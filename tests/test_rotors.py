@@ -114,14 +114,8 @@ def test_four_of_more_than_four_thrusts_make_a_wrench_by_the_least_squares():
     ({"rotor_spin": [1, 1, 1, 1]}, "its 4 rotors cannot control yaw independently.* let some spin each way"),
     ({"rotor_spin": [1, 1, -1, -1]}, "its 4 rotors cannot control roll and yaw independently"),
     ({"rotor_positions": [[0.1 * i, 0.0] for i in (-3, -1, 1, 3)]}, "cannot control roll independently.* off one line"),
-    (
-        {"rotor_positions": [[0.2 + x, y] for x, y in LAYOUTS["h"]["rotor_positions"]]},
-        "have to carry .*x = y = 0, between",
-    ),
-    (
-        {"rotor_spin": [1, -1, 1]},
-        r"field 'rotor_spin' has shape \(3,\); it must be \(4,\) .* the 4 rotors of rotor_positions",
-    ),
+    ({"rotor_positions": [[0.2 + x, y] for x, y in LAYOUTS["h"]["rotor_positions"]]}, "have to carry .*x = y = 0"),
+    ({"rotor_spin": [1, -1, 1]}, r"field 'rotor_spin' has shape \(3,\); it must be \(4,\) .* the 4 rotors"),
     ({"rotor_direction": [[0, 0, 0]] * 4}, "'rotor_direction' must be a direction for each rotor"),
     ({"rotor_effectiveness": [-1, 1, 1, 1]}, "'rotor_effectiveness' must be between 0 and 10"),
 )
@@ -191,22 +185,10 @@ class Writes(Disturbance):
 
 
 @cases(
-    (
-        Writes("rotor_speed"),
-        {},
-        r"Writes.advance writes 'rotor_speed', which follows the command .*rotor_effectiveness",
-    ),
-    (
-        Writes("angular_velocity", torch.zeros(2, 3)),
-        {"dynamics": "point_mass"},
-        "writes 'angular_velocity', which follows",
-    ),
+    (Writes("rotor_speed"), {}, r"advance writes 'rotor_speed', which follows the command .*rotor_effectiveness"),
+    (Writes("angular_velocity", torch.zeros(2, 3)), {"dynamics": "point_mass"}, "'angular_velocity', which follows"),
     (Writes(("drone", "rotor_effectiveness")), {}, "which the state lacks, so that it would be lost. Give it in start"),
-    (
-        Writes("velocity", torch.zeros(2, 1)),
-        {},
-        r"must give 'velocity' as the state has it, \(\(2, 3\), torch.float32\)",
-    ),
+    (Writes("velocity", torch.zeros(2, 1)), {}, r"must give 'velocity' as the state has it, \(\(2, 3\)"),
     (
         Writes(("drone", "rotor_effectiveness"), torch.ones(2, 1), torch.ones(2, 1)),
         {},

@@ -172,9 +172,7 @@ def test_a_policy_with_eyes_sees_in_mujoco_what_it_sees_in_ours(export_once, mon
     blind = fly(bundle, "mujoco", episodes=8)
     assert np.abs(blind["action"] - theirs["action"]).max() > 2.0 * gap
     monkeypatch.setattr(MuJoCo, "sees", False)
-    refuses(
-        "mujoco has no camera, and this policy reads images. Fly it in", fly, bundle, "mujoco", error=UserValueError
-    )
+    refuses("mujoco has no camera, and this policy reads images. Fly it", fly, bundle, "mujoco", error=UserValueError)
 
 
 def test_gates_and_laps_are_counted_from_the_lines_between_positions(export_once):

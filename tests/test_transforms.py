@@ -189,9 +189,7 @@ def test_what_flies_in_torchrl_s_loop_says_why():
     assert reason(RewardSum(), FrameSkipTransform(2)).reason.startswith("FrameSkipTransform is none of")
     assert "'step_count' is written before" in reason(StepCounter(max_steps=3), StepCounter(max_steps=4)).reason
     for drops in (ExcludeTransform("step_count"), RenameTransform(["step_count"], ["n"])):
-        assert reason(StepCounter(), drops).reason.startswith(
-            "'step_count' is counted in a step, and a later transform"
-        )
+        assert reason(StepCounter(), drops).reason.startswith("'step_count' is counted in a step, and a later")
     env, flights = HoveringEnv(num_envs=2), []
     for flown in (env, TransformedEnv(env, FrameSkipTransform(3))):  # it flies no further, as docs/engine.md says
         env.set_seed(0)

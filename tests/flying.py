@@ -2,6 +2,8 @@
 
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 # Drones of every kind of controller settings, for flights that would take too long with all that ship.
 FLOWN = ("crazyflie", "flightmare", "small_racer", "visfly")
@@ -28,6 +30,27 @@ def start(env, **entries):
     for key, value in entries.items():
         td["state", key] = torch.as_tensor(value, dtype=td["state", key].dtype).expand_as(td["state", key]).clone()
     return env.reset(td, set_state=True)
+
+
+def anew(env, seed=0):
+    """The environment, whose generator and torch's own begin from a seed."""
+    env.set_seed(seed)
+    torch.manual_seed(seed)
+    return env
+
+
+def pushed(env, actor, at, push):
+    """Nine steps in TorchRL's loop, without a graph; ``push`` changes what the actor writes in step ``at``."""
+    count = iter(range(100))
+
+    def policy(td):
+        td = actor(td)
+        if next(count) == at:
+            push(td)
+        return td
+
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        return EnvBase.rollout(anew(env), 9, policy, auto_cast_to_device=False, break_when_any_done=False)
 
 
 def look_at_nothing(patch):

@@ -4,6 +4,7 @@ import copy
 
 import pytest
 import torch
+from flying import anew, pushed
 from refusals import cases, refuses
 from tensordict.nn import (
     NormalParamExtractor,
@@ -38,9 +39,7 @@ def env():
 
 
 def flight(env, actor, steps=9):
-    env.set_seed(0)
-    torch.manual_seed(0)
-    return differentiable_rollout(env, actor, None, steps)[0]
+    return differentiable_rollout(anew(env), actor, None, steps)[0]
 
 
 def gradient(loss, rollout):
@@ -77,27 +76,14 @@ def test_the_gradient_of_an_action_is_that_of_all_that_follows_in_torchrls_loop_
     again = torch.autograd.grad(objective(rollout), list(actor.parameters()))  # the graph is still whole
     assert all(g.isfinite().all() for g in again)
 
-    env.set_seed(0)
-    torch.manual_seed(0)
     with set_exploration_type(ExplorationType.RANDOM):
-        slow = EnvBase.rollout(env, 9, actor, break_when_any_done=False)
+        slow = EnvBase.rollout(anew(env), 9, actor, break_when_any_done=False)
     torch.testing.assert_close(action_gradient(objective(slow), slow["action"]), found)
 
     def with_push(size):
-        """The objective with all of a policy's actions, but one is pushed, and the policy goes on from there."""
-        env.set_seed(0)
-        torch.manual_seed(0)
-        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-            policy, count = actor, iter(range(100))
-
-            def push(td):
-                td = policy(td)
-                if next(count) == 2:
-                    td["action"][1, 2] += size
-                return td
-
-            rollout = EnvBase.rollout(env, 9, push, auto_cast_to_device=False, break_when_any_done=False)
-        return objective(rollout)
+        """The objective where one action is pushed."""
+        with torch.no_grad():
+            return objective(pushed(env, actor, 2, lambda td: td["action"][1, 2].add_(size)))
 
     numeric = (with_push(1e-5) - with_push(-1e-5)) / 2e-5
     torch.testing.assert_close(found[1, 2, 2], numeric, rtol=1e-6, atol=1e-9)

@@ -5,11 +5,10 @@ import pickle
 
 import pytest
 import torch
+from flying import anew, pushed
 from refusals import refuses
 from test_objectives import GAMMA, LAMBDA, REWARDS, doubling, make_abpt, make_networks, make_rollout, td_lambda
 from torch.distributions import Normal
-from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import TanhNormal
 from torchrl.objectives import ValueEstimators
 
@@ -84,9 +83,7 @@ def test_the_gradient_of_sapo_is_that_of_finite_differences(env64, clip):
     weight = actor[0].module.mlp[-1].bias  # of means and scales
 
     def value():
-        env.set_seed(0)
-        torch.manual_seed(0)
-        return loss.loss_actor(differentiable_rollout(env, actor, None, 5)[0])[0]
+        return loss.loss_actor(differentiable_rollout(anew(env), actor, None, 5)[0])[0]
 
     (grad,) = torch.autograd.grad(value(), weight)
     for entry in (1, 5):  # clipped, the entropy counts at fixed states: only a later one could have another gradient
@@ -165,12 +162,8 @@ def test_one_step_towards_better_actions_goes_where_the_loss_itself_goes(env64):
     compiled = HoveringEnv(num_envs=2, compile={"backend": "eager"})
     other = make_actor(compiled)
     flown, _ = differentiable_rollout(compiled, other, None, 3)
-    refuses(
-        "differentiates twice, and a compiled flight only once: call env.eager",
-        PODSLoss(other, order=2),
-        flown,
-        error=NotImplementedError,
-    )
+    why = "differentiates twice, and a compiled flight only once: call env.eager"
+    refuses(why, PODSLoss(other, order=2), flown, error=NotImplementedError)
 
 
 # -- AHAC --------------------------------------------------------------------------------------------------------------
@@ -277,9 +270,7 @@ def make_loss(env, correlation=0.0, learn_scale=True, **options):
 
 
 def flight(env, loss, steps=9):
-    env.set_seed(0)
-    torch.manual_seed(0)
-    return differentiable_rollout(env, loss.actor_network, None, steps)[0]
+    return differentiable_rollout(anew(env), loss.actor_network, None, steps)[0]
 
 
 def gradient(loss, value):
@@ -297,21 +288,15 @@ def test_the_gradient_of_a_mean_is_that_of_its_own_return(env, correlation):
 
     def with_push(size):
         """The flight with an action that is moved before the tanh; noise that is correlated goes on from there."""
-        env.set_seed(0)
-        torch.manual_seed(0)
-        count = iter(range(100))
 
-        def pushed(td):
-            td = loss.actor_network(td)
-            if next(count) == step:
-                td["action"][drone, 2] = (torch.atanh(td["action"][drone, 2]) + size).tanh()
-                if correlation:
-                    noise_scale = td["scale"][drone, 2] / (1 - correlation**2) ** 0.5
-                    td["noise"][drone, 2] += size / noise_scale
-            return td
+        def move(td):
+            td["action"][drone, 2] = (torch.atanh(td["action"][drone, 2]) + size).tanh()
+            if correlation:
+                noise_scale = td["scale"][drone, 2] / (1 - correlation**2) ** 0.5
+                td["noise"][drone, 2] += size / noise_scale
 
-        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-            flown = EnvBase.rollout(env, 9, pushed, auto_cast_to_device=False, break_when_any_done=False)
+        with torch.no_grad():
+            flown = pushed(env, loss.actor_network, step, move)
             return loss.write_value_target(flown)["value_target"][drone, step, 0]
 
     numeric = (with_push(push) - with_push(-push)) / (2 * push)

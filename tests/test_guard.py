@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from flying import FLOWN, fly
+from flying import FLOWN, anew, fly
 from refusals import cases, refuses
 from tensordict import TensorDict
 
@@ -18,9 +18,7 @@ def gradients_of_the_first(env, key=None, value=None):
     """Of the rewards of environment 0, in the mass and a policy's weights, beside a neighbour with this entry."""
     mass = env.nominal.mass.clone().requires_grad_()
     env.params = env.nominal.replace(mass=mass)
-    env.set_seed(0)
-    torch.manual_seed(0)
-    actor, td, rewards, crashes = make_actor(env), env.reset(), [], []
+    actor, td, rewards, crashes = make_actor(anew(env)), env.reset(), [], []
     if key is not None:
         td["state", key][1] = torch.as_tensor(value)
     for _ in range(3):

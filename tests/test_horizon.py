@@ -4,7 +4,8 @@ import copy
 
 import pytest
 import torch
-from flying import Looks, look_at_nothing
+from flying import Looks, anew, look_at_nothing
+from refusals import refuses
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torch._dynamo.utils import counters
@@ -139,14 +140,9 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
     actor = make_actor(env, in_keys=["observation", ("state", "velocity")], return_log_prob=True)
     called = TensorDictSequential(actor)
 
-    def seeded():
-        env.set_seed(0)
-        torch.manual_seed(0)
-
     def train(policy):
         """Two horizons, through the ends of episodes, from a start that wants a gradient."""
-        seeded()
-        start = env.reset()
+        start = anew(env).reset()
         start["state", "position"][:2] = start["state", "target"][:2] - torch.tensor([0.5, 0.0, 0.0])
         start["state", "velocity"][:2, 0] = 3.0  # through the gate, which is an event
         start["state", "velocity"].requires_grad_()
@@ -157,27 +153,24 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
         return flight, torch.autograd.grad(losses_of(flight) + losses_of(more), wanted)
 
     def optimise_actions():
-        seeded()
+        anew(env)
         actions = (env.hover_action + 0.05 * torch.ones(14, 4, 4, dtype=env.dtype)).requires_grad_()
         flight, _ = differentiable_rollout(env, ActionSequence(actions), None, 14)
         torch.testing.assert_close(flight["action"], actions.transpose(0, 1))
         return flight, torch.autograd.grad(losses_of(flight), actions)
 
     def train_with_clipped_gradients():
-        seeded()
-        flight, _ = differentiable_rollout(env, actor, None, 14)
+        flight, _ = differentiable_rollout(anew(env), actor, None, 14)
         loss = BPTTLoss(actor, clip_action_gradient=2.0).loss_actor(flight)[0]
         return flight, torch.autograd.grad(loss, list(actor.parameters()))
 
     def audit():
         """The gradients in actions."""
-        seeded()
-        flight, _ = differentiable_rollout(env, actor, None, 14)
+        flight, _ = differentiable_rollout(anew(env), actor, None, 14)
         return {name: term.gradient_norm for name, term in audit_reward(flight, flight["action"]).items()}
 
     def all_ways():
-        seeded()
-        in_torchrls_loop = fly(torchrls_loop(env), env, actor, env.reset(), 12)
+        in_torchrls_loop = fly(torchrls_loop(env), env, actor, anew(env).reset(), 12)
         with monkeypatch.context() as patch:
             look_at_nothing(patch)
             as_on_an_accelerator = train(actor)
@@ -262,8 +255,7 @@ def test_without_a_cpp_compiler_the_step_stays_eager_and_says_so(monkeypatch):
 @pytest.mark.parametrize("options", [{"mode": "reduce-overhead"}, {"options": {"triton.cudagraphs": True}}])
 def test_cuda_graphs_are_refused_since_a_horizon_keeps_all_of_its_steps(options):
     env = HoveringEnv(num_envs=2)
-    with pytest.raises(Unsupported, match="max-autotune-no-cudagraphs"):
-        env.compile(**options)
+    refuses("max-autotune-no-cudagraphs", env.compile, error=Unsupported, **options)
     assert env.compile(mode="max-autotune-no-cudagraphs", options=None).is_compiled
 
 

@@ -5,6 +5,8 @@ import math
 
 import pytest
 import torch
+from flying import anew
+from refusals import refuses
 from torch.distributions import Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
 from torch.func import functional_call
@@ -81,8 +83,7 @@ def test_a_flight_is_that_of_torchrls_loop_with_its_transforms_and_forgets_where
     wrapped = TransformedEnv(env, Compose(InitTracker(), actor.make_tensordict_primer()))
     flights = []
     for flown in (env, wrapped):
-        env.set_seed(1)
-        torch.manual_seed(1)
+        anew(env, 1)
         flight, carry = differentiable_rollout(flown, actor, None, 16)
         loss = flight["next", "reward"].sum() + flight["next", "observation"].square().sum() + flight["loc"].sum()
         flights.append((flight, carry, torch.autograd.grad(loss, list(actor.parameters()))))
@@ -120,9 +121,7 @@ def test_a_policy_in_a_compiled_horizon_sees_and_remembers_as_in_an_eager_flight
     if way == "called":
         actor[0][0].register_forward_hook(lambda *_: None)
     for _ in range(2):
-        env.set_seed(1)
-        torch.manual_seed(1)
-        _, carry = differentiable_rollout(env, actor, None, 2)
+        _, carry = differentiable_rollout(anew(env, 1), actor, None, 2)
         flight, _ = differentiable_rollout(env, actor, carry, 4)
         loss = flight["next", "reward"].sum() + flight["next", "observation"].square().sum() + flight["loc"].sum()
         loss = loss + flight["next", MEMORY].square().sum() + flight[MEMORY].sum()
@@ -171,11 +170,7 @@ def test_an_empty_memory_is_none():
         width = SMALL["num_cells"][-1]
         plain[0][1].module.mlp[-1].weight.copy_(recurrent[0][2].module.mlp[-1].weight[:, :width])
         plain[0][1].module.mlp[-1].bias.copy_(recurrent[0][2].module.mlp[-1].bias)
-    flights = []
-    for actor in (recurrent, plain):
-        env.set_seed(0)
-        torch.manual_seed(0)
-        flights.append(env.rollout(4, actor, break_when_any_done=False))
+    flights = [anew(env).rollout(4, actor, break_when_any_done=False) for actor in (recurrent, plain)]
     torch.testing.assert_close(flights[0]["action"], flights[1]["action"])
     assert (flights[0][MEMORY] == 0).all()
 
@@ -244,14 +239,10 @@ def test_loc_scale_and_log_probability_are_those_given_the_noise_of_the_step_bef
 
 
 def test_what_cannot_be_seen_is_refused():
-    with pytest.raises(ValueError, match="Give it a camera"):
-        make_visual_actor(HoveringEnv(num_envs=1))
+    refuses("Give it a camera", make_visual_actor, HoveringEnv(num_envs=1))
     env = forest(num_envs=1)
     for name, wrong, example in (("channels", ((), 8, (2.5,)), "8, 16"), ("num_cells", ((), 64, (2.5,), (0,)), "64")):
         for value in wrong:
-            with pytest.raises(ValueError, match=f"{name}.* must .*in a list: .{example}."):
-                make_visual_actor(env, **{name: value})
-    with pytest.raises(ValueError, match="recurrent=False"):
-        make_visual_actor(env, recurrent=False).make_tensordict_primer()
-    with pytest.raises(ValueError, match="InitTracker"):
-        EnvBase.rollout(env, 2, make_visual_actor(env))
+            refuses(f"{name}.* must .*in a list: .{example}.", make_visual_actor, env, **{name: value})
+    refuses("recurrent=False", make_visual_actor(env, recurrent=False).make_tensordict_primer)
+    refuses("InitTracker", EnvBase.rollout, env, 2, make_visual_actor(env))

@@ -9,11 +9,12 @@ import torch
 from refusals import cases, refuses
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
+from test_bounded_steps import LOSSES
 from test_loss_modules import pendulum_networks
 from torch import nn
 from torchrl.envs import PendulumEnv
 
-from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_env, make_qvalue, make_value
+from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_env
 from torchrl_quad.diagnostics import audit_reward, compare_gradients, gradient_by_horizon, gradient_statistics
 from torchrl_quad.envs.terms import distance
 from torchrl_quad.objectives import ABPTLoss, BPTTLoss, SHACLoss
@@ -275,11 +276,7 @@ def test_the_spread_of_the_gradients_is_that_worked_by_hand():
 def test_the_variance_is_that_of_a_loop_with_backward_and_leaves_no_grad_behind(name):
     env = HoveringEnv(num_envs=5, dtype=torch.float64)
     actor = make_actor(env, num_cells=(8,))
-    loss = {
-        "bptt": lambda: BPTTLoss(actor, reduction="none"),
-        "shac": lambda: SHACLoss(actor, make_value(env), reduction="none"),
-        "abpt": lambda: ABPTLoss(actor, make_qvalue(env), reduction="none"),
-    }[name]()
+    loss = LOSSES[name](env, actor, reduction="none")
     start = env.reset()
 
     def rollout(horizon):

@@ -58,6 +58,7 @@ def test_an_unknown_option_is_refused_with_the_closest_one_and_all_of_them():
         "its 4 rotors cannot control roll and pitch independently. It takes four or more with a torque about each axis",
     ),
     ({"drone": None}, "drone must be the name of a preset, .* or QuadrotorParams, got None"),
+    ({"auto_reset": True}, "auto_reset=True is for environments that reset themselves"),
     ({"dtype": torch.int32}, "dtype must be torch.float32 or torch.float64"),
     ({"dynamics": "plane"}, r"dynamics must be one of quadrotor, point_mass(, \w+)*, got 'plane'"),
     ({"action_delay": 0, "observe_last_action": True}, "without a delay there are none"),
@@ -101,6 +102,11 @@ def test_a_bad_value_is_refused_by_name(kwargs, message):
         "initial_state",
         lambda env, n: {**HoveringEnv.initial_state(env, n), "legs": torch.rand(n, 1)},
         "initial_state: 'legs' differs between calls with one seed. Draw from self.uniform",
+    ),
+    (
+        "initial_state",
+        lambda env, n: env.hover_state(torch.zeros(n, 3))["step"],
+        "initial_state asks for 'step', which hover_state does not give: it has position, ",
     ),
     ("initial_state", adding(legs=torch.zeros(4, 1).int()), r"'legs' must be .* int64 or bool; got .* torch.int32\)"),
 )

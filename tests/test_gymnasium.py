@@ -121,17 +121,6 @@ def test_episodes_end_and_begin_as_in_gymnasium_s_own_vector_environment(mode):
     assert (timeouts[3:] > 2).all()
 
 
-def test_a_reset_mask_leaves_the_other_drones_where_they_are():
-    env = GymVectorEnv("tracking", 3, autoreset_mode="Disabled")
-    env.reset(seed=0)
-    for actions in some_actions(3, 3):
-        before = env.step(actions)[0]
-    mask = np.array([False, True, False])
-    after, info = env.reset(options={"reset_mask": mask})
-    assert (before != after).any(1).tolist() == info["_success"].tolist() == mask.tolist()
-    assert env.now["state", "step"].flatten().tolist() == [3, 0, 3]
-
-
 @pytest.mark.parametrize("mode", MODES)
 def test_many_drones_give_a_picture_each_of_where_they_are(mode):
     options = {"dtype": torch.float64, "max_episode_steps": 7, "render_mode": "rgb_array"}
@@ -163,7 +152,7 @@ def test_without_a_render_mode_or_an_episode_there_is_no_picture():
         refuses(r"call reset\(\) first", build("hovering", render_mode="rgb_array").render, error=ResetNeeded)
 
 
-def test_a_seed_repeats_the_flight_and_no_seed_goes_on_drawing():
+def test_a_seed_repeats_the_flight_no_seed_goes_on_drawing_and_environments_that_nobody_seeds_start_differently():
     env = GymVectorEnv("hovering", 4, wind={"gust": 1.0})
 
     def fly(seed):
@@ -172,12 +161,9 @@ def test_a_seed_repeats_the_flight_and_no_seed_goes_on_drawing():
 
     np.testing.assert_array_equal(fly(5), fly(5))
     assert (fly(5) != fly(6))[:, :, :3].any((1, 2)).all() and (fly(5)[0] != fly(None)[0]).any()
-
-
-@pytest.mark.parametrize("options", [{}, {"seed": 3}])
-def test_environments_that_nobody_seeds_start_differently_as_in_gymnasium(options):
-    one, other = (GymEnv("hovering", **options).reset()[0] for _ in range(2))
-    assert (one == other).all() == bool(options)
+    for options in ({}, {"seed": 3}):
+        one, other = (GymEnv("hovering", **options).reset()[0] for _ in range(2))
+        assert (one == other).all() == bool(options)
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])

@@ -168,11 +168,13 @@ def test_a_run_that_lost_a_third_of_what_it_solved_goes_back_to_its_best_policy_
     assert_equal(straight, saved[8])
 
 
-def test_what_the_command_line_says_must_agree_with_the_checkpoint(train, refused, tmp_path):
-    train("bptt", tmp_path)
-    small = [*SMALL, f"hydra.run.dir={tmp_path}"]
+def test_a_run_goes_on_if_the_command_line_agrees_in_the_folder_of_its_checkpoint_or_of_the_one_before_a_damaged_one(
+    train, launch, refused, tmp_path
+):
+    folder, path = tmp_path / "run", tmp_path / "run/checkpoint.pt"
+    straight, small = train("bptt", folder), [*SMALL, f"hydra.run.dir={folder}"]
     said = refused("bptt", *small)
-    assert f"{tmp_path} holds another run. Continue with it, resume={tmp_path}/checkpoint.pt, or choose another" in said
+    assert f"{folder} holds another run. Continue with it, resume={path}, or choose another" in said
     for words, message in {
         "bptt env.drone=small_racer": "env.drone=small_racer contradicts the checkpoint .*trained with env.drone=visf",
         "bptt tuned=bptt_racing": "gamma=.* contradicts the checkpoint",
@@ -181,15 +183,21 @@ def test_what_the_command_line_says_must_agree_with_the_checkpoint(train, refuse
     }.items():
         recipe, *changes = words.split()
         assert re.search(message, refused(recipe, *small, "resume=auto", *changes))
-
-
-def test_a_run_that_is_resumed_by_path_goes_on_in_the_folder_of_its_checkpoint(train, launch, refused, tmp_path):
-    saved, path = train("bptt", tmp_path / "first"), tmp_path / "first/checkpoint.pt"
     said = refused("bptt", f"resume={path}", "total_steps=240", f"hydra.run.dir={tmp_path}/elsewhere")
     assert f"hydra.run.dir={tmp_path}/elsewhere has no effect: resume={path} continues in the folder of that" in said
+    damaged = bytearray(path.read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    path.write_bytes(damaged)
+    said = refused("bptt", *small, "resume=auto")
+    assert f"{path} is damaged: its checksum does not fit its content." in said
+    assert said.endswith(f"Continue from the checkpoint before it: resume={folder}/checkpoint.previous.pt")
+    assert read_checkpoint(previous(path))["iteration"] == 6
+    launch("bptt", f"resume={previous(path)}")
+    assert read_checkpoint(path)["iteration"] == straight["iteration"] == 8
+    torch.testing.assert_close(read_checkpoint(path)["best"]["actor"], straight["best"]["actor"], rtol=0, atol=0)
+    assert read_checkpoint(previous(path))["iteration"] == 6  # and not the damaged one
     launch("bptt", f"resume={path}", "total_steps=240")
-    assert (saved["iteration"], read_checkpoint(path)["iteration"]) == (8, 10)
-    assert not (tmp_path / "elsewhere").exists()
+    assert read_checkpoint(path)["iteration"] == 10 and not (tmp_path / "elsewhere").exists()
 
 
 def test_two_runs_of_one_second_get_folders_of_their_own(launch, no_pictures, tmp_path, monkeypatch):
@@ -305,22 +313,6 @@ def test_no_flipped_bit_of_a_checkpoint_goes_unnoticed(tmp_path):
         refuses(r"checkpoint\.pt (is damaged|is cut off)", read_checkpoint, path)
 
 
-def test_a_run_goes_on_from_the_checkpoint_before_a_damaged_one(train, refused, launch, tmp_path):
-    straight = train("bptt", tmp_path)
-    path = tmp_path / "checkpoint.pt"
-    damaged = bytearray(path.read_bytes())
-    damaged[len(damaged) // 2] ^= 1
-    path.write_bytes(damaged)
-    said = refused("bptt", *SMALL, f"hydra.run.dir={tmp_path}", "resume=auto")
-    assert f"{path} is damaged: its checksum does not fit its content." in said
-    assert said.endswith(f"Continue from the checkpoint before it: resume={tmp_path}/checkpoint.previous.pt")
-    assert read_checkpoint(previous(path))["iteration"] == 6
-    launch("bptt", f"resume={previous(path)}")
-    assert read_checkpoint(path)["iteration"] == 8
-    torch.testing.assert_close(read_checkpoint(path)["best"]["actor"], straight["best"]["actor"], rtol=0, atol=0)
-    assert read_checkpoint(previous(path))["iteration"] == 6  # and not the damaged one
-
-
 def test_a_file_that_is_no_checkpoint_of_this_version_is_named_with_the_reason(refused, tmp_path):
     path = tmp_path / "bad.pt"
 
@@ -383,12 +375,12 @@ def write_own(path, content, **changes):
     write_checkpoint(path, {**{k: v for k, v in content.items() if k != "format"}, **changes})
 
 
-def test_a_configuration_from_somebody_else_runs_no_code_and_passes_the_schema_or_is_refused(
+def test_a_checkpoint_from_somebody_else_runs_no_code_and_is_refused_in_one_line_if_its_parts_do_not_fit(
     train, refused, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "evilmod.py").write_text("open('ran', 'w')")
-    saved, path = train("bptt", tmp_path / "run"), tmp_path / "run/checkpoint.pt"
+    saved, path = train("abpt", tmp_path / "run"), tmp_path / "run/checkpoint.pt"
     for text, message in EVIL.items():
         values = yaml.safe_load(saved["config"])
         try:
@@ -397,15 +389,11 @@ def test_a_configuration_from_somebody_else_runs_no_code_and_passes_the_schema_o
             values = None
         is_whole = values is None or "${" in text or "&" in text or not text
         write_own(path, saved, config=text if is_whole else yaml.safe_dump(values))
-        recipes = [["evaluate", f"checkpoint={path}"], ["bptt", f"resume={path}", "total_steps=240"]]
+        recipes = [["evaluate", f"checkpoint={path}"], ["abpt", f"resume={path}", "total_steps=240"]]
         for recipe, *words in recipes if "evilmod" in text else recipes[:1]:
             said = refused(recipe, *words)
             assert f"{path}: the configuration in it" in said and message in said, (text, said)
     assert not (tmp_path / "ran").exists()
-
-
-def test_content_that_does_not_fit_its_configuration_is_refused_in_one_line(train, refused, tmp_path):
-    saved, path = train("abpt", tmp_path), tmp_path / "checkpoint.pt"
     weights = {name: x[:1] for name, x in saved["best"]["actor"].items()}
     for change in (
         {"best": {}},

@@ -292,6 +292,9 @@ def test_what_is_not_a_disturbance_is_refused(wrong, error, message):
     refuses(message, HoveringEnv, error=error, num_envs=1, disturbances=wrong, dynamics="point_mass")
 
 
+EFFECT = "drone", "rotor_effectiveness"
+
+
 class Faulty(Disturbance):
     """Returns what it is told to."""
 
@@ -313,10 +316,14 @@ class Faulty(Disturbance):
     ({}, {}, None, "Faulty.observe must return the whole state. Start from {..state, ...}"),
     ({("drone", "mass"): -torch.ones(1, 1)}, {}, {}, "'mass'.*, from Faulty.start, must be finite and, .* above zero"),
     ({"position": torch.zeros(1, 4)}, {}, {}, r"'position', from Faulty.start, must have shape \(1, 3\), got \(1, 4\)"),
+    ({EFFECT: torch.ones(1, 1)}, {}, {}, r"'rotor_effectiveness'\), from .*must have shape \(1, 4\), got \(1, 1\)"),
+    ({}, {EFFECT: torch.ones(1, 4)}, {}, "which the state lacks, so that it would be lost. Give it in start"),
+    ({}, {"velocity": torch.zeros(1, 1)}, {}, r"must give 'velocity' as the state has it, \(\(1, 3\), torch.float32"),
+    ({}, {"rotor_speed": torch.zeros(1, 4)}, {}, "writes 'rotor_speed', which follows the .*rotor_effectiveness"),
     ({}, {"angular_velocity": torch.zeros(1, 3)}, {}, "'angular_velocity', which follows the .* would be undone.$"),
 )
-def test_what_a_disturbance_does_wrong_is_named(start, changed, seen, message):
-    dynamics = "point_mass" if changed else "quadrotor"
+def test_what_a_disturbance_does_wrong_or_in_vain_is_named(start, changed, seen, message):
+    dynamics = "point_mass" if "angular_velocity" in (changed or {}) else "quadrotor"
     refuses(message, HoveringEnv, num_envs=1, disturbances=[Faulty(start, changed, seen)], dynamics=dynamics)
 
 

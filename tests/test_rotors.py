@@ -171,34 +171,6 @@ def test_gradients_reach_the_effectiveness_of_rotors_in_the_state_and_agree_with
     assert torch.autograd.gradcheck(ends, works, atol=1e-6, rtol=1e-5)
 
 
-class Writes(Disturbance):
-    """Gives one entry at the start, and writes another."""
-
-    def __init__(self, key, value=None, start=None):
-        self.key, self.value, self.first = key, value, start
-
-    def start(self, random, state):
-        return {} if self.first is None else {self.key: self.first}
-
-    def advance(self, state, noise, dt):
-        return {self.key: torch.zeros(2, 4) if self.value is None else self.value}
-
-
-@cases(
-    (Writes("rotor_speed"), {}, r"advance writes 'rotor_speed', which follows the command .*rotor_effectiveness"),
-    (Writes("angular_velocity", torch.zeros(2, 3)), {"dynamics": "point_mass"}, "'angular_velocity', which follows"),
-    (Writes(("drone", "rotor_effectiveness")), {}, "which the state lacks, so that it would be lost. Give it in start"),
-    (Writes("velocity", torch.zeros(2, 1)), {}, r"must give 'velocity' as the state has it, \(\(2, 3\)"),
-    (
-        Writes(("drone", "rotor_effectiveness"), torch.ones(2, 1), torch.ones(2, 1)),
-        {},
-        r"'rotor_effectiveness'\), from Writes.start, must have shape \(2, 4\), got \(2, 1\)",
-    ),
-)
-def test_what_a_disturbance_changes_in_vain_is_refused(disturbance, options, message):
-    refuses(message, HoveringEnv, num_envs=2, disturbances=disturbance, **options)
-
-
 def test_a_worn_drone_flies_worn_while_its_controller_believes_it_whole_and_other_drones_do_not_fit():
     worn = load_drone("visfly").replace(rotor_effectiveness=[0.5, 1.0, 1.0, 1.0])
     env = HoveringEnv(num_envs=1, drone=worn)

@@ -35,6 +35,7 @@ from torchrl_quad.identification.prediction import prediction_error
 
 REAL = ROOT / "examples/data/figure8.csv.gz"
 BRIEF = {"horizon": 0.2, "past": 0.1}
+QUICK = {"fields": ["linear_drag"], "draws": 0} | BRIEF
 pytestmark = pytest.mark.usefixtures("quick_fits")
 
 
@@ -51,6 +52,11 @@ def simulated():
 @pytest.fixture(scope="module")
 def real():
     return read_log(REAL)
+
+
+@pytest.fixture(scope="module")
+def short(real):
+    return dataclasses.replace(real, segments=((300, 700),))
 
 
 @pytest.fixture
@@ -102,10 +108,8 @@ def test_a_fit_finds_the_drone_of_a_simulated_flight_and_writes_files_that_fly(s
 
 
 @pytest.mark.usefixtures("rough")
-def test_a_fit_that_was_stopped_goes_on_as_if_it_had_not(real, tmp_path, monkeypatch, capsys):
-    file, write = tmp_path / "checkpoint.json", estimation.Checkpoint.write
-    options = {"fields": ["linear_drag"], "draws": 0, "iterations": 9} | BRIEF
-    short = dataclasses.replace(real, segments=((300, 700),))
+def test_a_fit_that_was_stopped_goes_on_as_if_it_had_not(short, tmp_path, monkeypatch, capsys):
+    file, write, options = tmp_path / "checkpoint.json", estimation.Checkpoint.write, QUICK | {"iterations": 9}
     straight = identify(short, **options)
 
     def stop(self, stage, state):
@@ -220,7 +224,7 @@ def test_arguments_of_fits_and_predictions_are_refused_in_one_line_and_a_flight_
         return dataclasses.replace(real, segments=segments)
 
     usual = {
-        "identify": {"log": flown((300, 700)), "fields": ["linear_drag"], "iterations": 1, "draws": 0} | BRIEF,
+        "identify": QUICK | {"log": flown((300, 700)), "iterations": 1},
         "prediction_error": {"log": flown((300, 700)), "drone": "crazyflie", "horizons": (0.1,)},
     }
     functions = {"identify": identify, "prediction_error": prediction_error}
@@ -251,15 +255,14 @@ def test_arguments_of_fits_and_predictions_are_refused_in_one_line_and_a_flight_
 
 
 @pytest.mark.usefixtures("rough")
-def test_what_contradicts_the_drone_is_found_and_no_inertia_is_one_that_no_body_has(real):
-    short, options = dataclasses.replace(real, segments=((300, 700),)), {"fields": ["linear_drag"], "draws": 0} | BRIEF
+def test_what_contradicts_the_drone_is_found_and_no_inertia_is_one_that_no_body_has(real, short):
     turned = "the other way than the drone's.*Write rotor_spin: .1, -1, 1, -1. in the drone"
-    refuses(turned, identify, short, "crazyflie", {"rotor_spin": [-1, 1, -1, 1]}, **options)
+    refuses(turned, identify, short, "crazyflie", {"rotor_spin": [-1, 1, -1, 1]}, **QUICK)
     heavy = r"left over .*mass of 0.06 kg or its thrust.*name \"thrust_map\" in fields"
-    refuses(heavy, identify, short, "crazyflie", {"mass": 0.06}, iterations=1, **options)
+    refuses(heavy, identify, short, "crazyflie", {"mass": 0.06}, iterations=1, **QUICK)
     large = dataclasses.replace(short, battery_voltage=10.0 * real.battery_voltage)
-    refuses("a battery has 3.* V in the mean, and the drone's motor_command is for", identify, large, **options)
-    result = identify(short, iterations=1, **options)
+    refuses("a battery has 3.* V in the mean, and the drone's motor_command is for", identify, large, **QUICK)
+    result = identify(short, iterations=1, **QUICK)
     assert max(map(abs, result.trim["force_per_weight"])) < 0.1 and set(result.errors_by_flight) == {"figure8"}
     strong = dataclasses.replace(result, drone=result.drone.replace(thrust_map=1.8 * result.drone.thrust_map))
     assert "per mass the rotors give 1.80 times the thrust of the given drone" in strong.verdict
@@ -284,9 +287,9 @@ BROKEN_STAGES = (5, {}, {"free": 5}, DRAG, DRAG | {"x": [0], "streams": [0]})
 
 
 @pytest.mark.usefixtures("rough")
-def test_a_checkpoint_that_is_damaged_is_refused_and_named(real, tmp_path):
-    file, short = tmp_path / "checkpoint.json", dataclasses.replace(real, segments=((300, 700),))
-    options = {"fields": ["linear_drag"], "draws": 0, "iterations": 1, "checkpoint": file} | BRIEF
+def test_a_checkpoint_that_is_damaged_is_refused_and_named(short, tmp_path):
+    file = tmp_path / "checkpoint.json"
+    options = QUICK | {"iterations": 1, "checkpoint": file}
     identify(short, **options)
     whole = json.loads(file.read_text())
     first = next(iter(whole["stages"]))

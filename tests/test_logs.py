@@ -1,6 +1,5 @@
 """What a run logs, what it does with numbers that are not finite, and how recipes read what wandb's agent writes."""
 
-import csv
 import json
 import struct
 import sys
@@ -15,6 +14,7 @@ from refusals import cases
 from small_runs import EVERYTHING, SMALL, assert_equal, poison, rows, stop_at_save
 from torchrl import torchrl_logger
 
+from torchrl_quad.files import read_rows
 from torchrl_quad.training import loop
 from torchrl_quad.training.checkpoints import read_checkpoint, revision
 from torchrl_quad.training.configuration import hydra_argument
@@ -121,8 +121,7 @@ def test_tensorboard_gets_the_names_of_the_csv_and_forgets_what_is_flown_again(t
     train("bptt", tmp_path, "resume=auto")
     (folder,) = {path.parent for path in tmp_path.glob("**/events.out.tfevents*")}
     events = EventAccumulator(str(folder)).Reload()
-    with open(tmp_path / "metrics.csv", newline="") as file:
-        table = list(csv.DictReader(file))
+    table = read_rows(tmp_path / "metrics.csv")
     assert set(events.Tags()["scalars"]) == {name for name in table[0] if "/" in name}
     for name in events.Tags()["scalars"]:
         scalars = events.Scalars(name)

@@ -1,7 +1,6 @@
 """A bundle flies elsewhere as it does in our own simulator, is judged as our evaluation does, and its mutants fail."""
 
 import copy
-import csv
 import re
 import sys
 
@@ -21,6 +20,7 @@ from torchrl_quad.deploy.simulators.vehicle import ContractLoop, Drone
 from torchrl_quad.deploy.transfer import MUTANTS, fly
 from torchrl_quad.dynamics import FlightController
 from torchrl_quad.errors import UserError, UserValueError
+from torchrl_quad.files import read_rows
 
 NAMES = ("position", "quaternion", "velocity", "angular_velocity")
 STEPS = 110
@@ -222,24 +222,19 @@ runpy.run_path("recipes/transfer.py", run_name="__main__")
 """
 
 
-def rows(folder):
-    with open(folder / "transfer.csv", newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def test_the_recipe_flies_without_torch_keeps_a_table_and_finds_mistakes_of_a_port(hovering, tmp_path, launch):
     settings = [f"bundle={hovering}", f"folder={tmp_path}", "loop=contract"]
     run(sys.executable, "-c", WITHOUT_TORCH, *settings)
-    (first,) = rows(tmp_path)
+    (first,) = read_rows(tmp_path / "transfer.csv")
     assert (first["mutant"], first["solved"], first["episodes"]) == ("none", "1.0000", "8")
     printed = launch("transfer", *settings, "mutants=true")
     assert "MuJoCo" in printed and str(tmp_path / "transfer.csv") in printed
-    table = rows(tmp_path)
+    table = read_rows(tmp_path / "transfer.csv")
     assert table[0] == first and [row["mutant"] for row in table] == ["none", *MUTANTS][:-1]
     failed = {row["mutant"] for row in table if float(row["solved"]) <= 0.5}
     assert failed >= {"xyzw", "yaw", "heading", "motors", "frd"}
     launch("transfer", *settings, "mutants=true")  # finds all of it there
-    assert rows(tmp_path) == table
+    assert read_rows(tmp_path / "transfer.csv") == table
 
 
 def test_the_recipe_films_a_flight_beside_ours(hovering, tmp_path, launch, monkeypatch):

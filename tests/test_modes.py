@@ -68,16 +68,6 @@ def test_every_drone_flies_within_5_percent_of_a_commanded_velocity_but_for_what
     assert up.min() > math.cos(math.pi / 6)
 
 
-def test_one_rotor_alone_rolls_and_pitches_away_from_itself_and_yaws_by_its_spin():
-    drone = load_drone("visfly", F64)
-    share = 0.25 * 9.81 * drone.mass.item()
-    commands = torch.full((4, 4), share).fill_diagonal_(1.1 * share).tolist()
-    state = commanded(2, *commands, control="rotor_thrusts")[-1]
-    x, y = drone.rotor_positions.unbind(-1)
-    signs = torch.stack((y.sign(), -x.sign(), drone.rotor_spin), -1)
-    assert (state["angular_velocity"].sign() == signs).all() and (state["velocity"][:, 2] > 0).all()
-
-
 @each_mode
 @each_drone
 def test_the_hover_action_hovers_and_is_the_command_that_it_stands_for(control, drone):

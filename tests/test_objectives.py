@@ -87,14 +87,6 @@ def test_bptt_sums_the_discounted_rewards_of_each_segment():
     assert total.item() == -sum(REWARDS)
 
 
-def test_truncation_bootstraps_and_termination_does_not():
-    actor, value, _ = make_networks()
-    loss = SHACLoss(actor, value, reduction="none").make_value_estimator(gamma=GAMMA, lmbda=LAMBDA)
-    # environment 0: V(9) = 90 after two steps, V(5) = 50 after two; environment 1: none at step 2, V(5) after one.
-    expected = [14 + 90 / 4 + 50 / 4, 13.5 + 50 / 2]
-    assert loss.loss_actor(make_rollout(actor))[0].tolist() == [-x for x in expected]
-
-
 def test_abpt_averages_the_n_step_and_the_0_step_return():
     actor, *_ = make_networks()
 
@@ -175,10 +167,11 @@ def test_shac_as_published_by_xu_et_al_bootstraps_with_the_target_critic_and_div
     assert fly(target_bootstrap=True, delay_value=False) == critic  # there is no other network
 
 
-def test_the_objective_is_the_sum_of_its_parts():
+def test_the_objective_is_the_sum_of_its_parts_and_truncation_bootstraps_and_termination_does_not():
     actor, value, _ = make_networks()
     shac = SHACLoss(actor, value, reduction="none").make_value_estimator(gamma=GAMMA)
     abpt = make_abpt(actor, 10.0, reduction="none")
+    # SHAC: environment 0 has V(9) = 90 after two steps, V(5) = 50 after two; environment 1 has V(5) after one.
     parts = {
         BPTTLoss(actor, reduction="none").make_value_estimator(gamma=GAMMA): {"rewards": REWARDS},
         shac: {"rewards": REWARDS, "terminal_value": [90 / 4 + 50 / 4, 50 / 2]},

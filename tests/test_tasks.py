@@ -238,6 +238,9 @@ def test_a_track_comes_from_a_file_and_starts_lie_half_way_by_default(tmp_path):
     ({"gates": [[0, 0, 1], [1, 1, 1]], "starts": [[0, 0, 1]]}, "one start before each gate, got 1 for 2"),
     ({"gates": [[0, 0, 1], [1, 1, 1]], "starts": [[0, 0, 1], [9, 9, 1]]}, r"within 0.2 m of \[9.0, 9.0, 1.0\]"),
     ({"gates": [[0, 0, 0.1], [1, 1, 0.1]]}, "not all inside the box"),
+    ({"gates": [[0, 0, 1], [5, 0, 1]], "box": [[1, -1, 0], [4, 1, 2]]}, "gates stand from .*0.0, 0.0, 1.0.*"),
+    ({"gates": [[0, 0, 1], [5, 0, 1]], "position_jitter": [0, 0, 2]}, r"gates stand from \[0.0, 0.0, -1.0\] to "),
+    ({"file": "random", "position_jitter": [0, 0, 2]}, r"gates stand from \[-12.0, -12.0, -1.0\] to "),
     ({"gates": [[0, 0, 1], [1, 1, 1]], "gate_radius": 0}, "gate_radius must be at least 0.01, got 0. Of all gates"),
 )
 def test_a_track_that_nobody_can_fly_is_refused(track, message):

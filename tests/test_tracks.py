@@ -298,10 +298,8 @@ def test_tracks_of_other_projects_are_read_and_what_was_assumed_is_said(tmp_path
     (tmp_path / "first.toml").write_text(first.replace("[env.r", "gate_size = {width = 1.5, height = 1.4}\n[env.r"))
     first = load_track(tmp_path / "first.toml", box=[[-3, -3, 0], [3, 3, 2]])
     assert forward(torch.tensor(first["gates"][0]["rotation"])).tolist() == pytest.approx([0.707, -0.707, 0], abs=5e-3)
-    assert first["notes"][:2] == [
-        "gates are flown along their y axis",
-        "they are open 1.5 x 1.4 m, with frames of 0.09 m",
-    ]
+    along, opening = "gates are flown along their y axis", "they are open 1.5 x 1.4 m, with frames of 0.09 m"
+    assert first["notes"][:2] == [along, opening]
     # The newest files have an order of passages, which may go backwards, and the oldest no limits and other words.
     gates = [{"pos": [x, 0, 1], "rpy": [0, 0, 0]} for x in (0, 2, 4)]
     own = {"gates": gates, "gate_order": [3, -1, 3], "drone": {"pos": [-1, 0, 0]}}
@@ -354,15 +352,6 @@ def test_a_track_that_does_not_say_enough_is_refused_and_asks_by_name(track, set
     refuses(message, load_track, track, **settings)
 
 
-@cases(
-    ({"gates": [[0, 0, 1], [5, 0, 1]], "box": [[1, -1, 0], [4, 1, 2]]}, "gates stand from .*0.0, 0.0, 1.0.*"),
-    ({"gates": [[0, 0, 1], [5, 0, 1]], "position_jitter": [0, 0, 2]}, r"gates stand from \[0.0, 0.0, -1.0\] to "),
-    ({"file": "random", "position_jitter": [0, 0, 2]}, r"gates stand from \[-12.0, -12.0, -1.0\] to "),
-)  # fmt: skip
-def test_gates_that_nobody_can_reach_are_refused(track, message):
-    refuses(message, RacingEnv, num_envs=2, track=track)
-
-
 def test_what_is_given_with_a_track_replaces_what_the_track_says_and_its_result_is_a_track(tmp_path):
     track = random_track(3, gates=4)
     assert {gate["radius"] for gate in load_track(track, radius=0.5)["gates"]} == {0.5}
@@ -374,18 +363,15 @@ def test_what_is_given_with_a_track_replaces_what_the_track_says_and_its_result_
     changed = load_track(load_track("random"), width=2.0, height=1.0, floor=0.9)
     assert changed["gates"][0]["width"] == 2.0 and changed["random"] == load_track("random")["random"]
     assert len(load_track(load_track("random"), random={"gates": 4})["gates"]) == 4
-    as_tensors = [
-        {"position": torch.tensor(g["position"]), "rotation": np.array(g["rotation"])} for g in track["gates"]
-    ]
-    again = load_track({"gates": as_tensors}, width=1.5, height=1.5)
+    gates = track["gates"]
+    gates = [{"position": torch.tensor(x["position"]), "rotation": np.array(x["rotation"])} for x in gates]
+    again = load_track({"gates": gates}, width=1.5, height=1.5)
     assert [gate["rotation"] for gate in again["gates"]] == [gate["rotation"] for gate in track["gates"]]
     (tmp_path / "self.yaml").write_text(f"file: {tmp_path}/self.yaml")
     refuses("self.yaml: 10 tracks name each other as file; does one name itself", load_track, tmp_path / "self.yaml")
 
 
-@pytest.mark.parametrize(
-    "change", [{"start_range": 0.6}, {"position_jitter": [9, 9, 0.2]}, {"box": [[-3, -4, 0], [4, 4, 5]]}]
-)
+@cases(({"start_range": 0.6},), ({"position_jitter": [9, 9, 0.2]},), ({"box": [[-3, -4, 0], [4, 4, 5]]},))
 def test_episodes_on_random_tracks_start_inside_the_box(change):
     rules = {"gates": 4, "spacing": [1, 5], "heights": [0.3, 4], "yaw": 1.5}
     env = RacingEnv(num_envs=1000, track={"random": rules, "radius": 0.3, **change})

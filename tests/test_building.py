@@ -19,24 +19,10 @@ from torchrl_quad import DifferentiableCollector, HoveringEnv, differentiable_ro
 from torchrl_quad.envs.disturbances import Disturbance
 from torchrl_quad.modules import make_actor, make_qvalue, make_value
 from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, SHACLoss
-from torchrl_quad.training import building
-from torchrl_quad.training.building import (
-    AdaptiveOptimizer,
-    Optimizer,
-    ReturnScale,
-    TargetUpdate,
-    minibatches,
-    shuffled,
-)
+from torchrl_quad.training import building, evaluation
+from torchrl_quad.training.building import AdaptiveOptimizer, Optimizer, minibatches, shuffled
 from torchrl_quad.training.configuration import compose
-from torchrl_quad.training.evaluation import (
-    has_levelled_off,
-    has_lost_its_way,
-    last_rise,
-    looks_ahead,
-    merit,
-    next_pace,
-)
+from torchrl_quad.training.evaluation import has_levelled_off, last_rise, looks_ahead, merit, next_pace
 from torchrl_quad.training.loop import Run, backward
 
 
@@ -56,7 +42,7 @@ def numbered(*shape):
 def test_a_target_critic_follows_as_with_torchrl_s_soft_update(kind, critic):
     env = HoveringEnv(num_envs=1)
     targets = []
-    for update in (TargetUpdate, SoftUpdate):
+    for update in (building.TargetUpdate, SoftUpdate):
         torch.manual_seed(0)
         loss = kind(make_actor(env), critic(env))
         updater = update(loss, tau=0.1)
@@ -102,21 +88,18 @@ class Blind(HoveringEnv):
 @cases(
     (["env.disturbances=[test_building.Known]"], {("state", "rotor_speed"): 1e-3}),
     (["task=test_building.Blind"], {("state", "position"): 0.5}),
-    (
-        ["env.randomize=any", "env.control=rotor_thrusts", "env.drone=cf2x"],
-        {("state", "traits"): 1.0, ("state", "rotor_speed"): 1e-3},
-    ),
+    (["env.randomize=any", "env.control=rotor_thrusts", "env.drone=cf2x"],
+        {("state", "traits"): 1.0, ("state", "rotor_speed"): 1e-3}),
     (["env.drone=cf2x"], {}),
-)
+)  # fmt: skip
 def test_critics_read_what_a_task_or_a_disturbance_keeps_from_policies_which_then_have_a_memory(words, read):
     cfg = compose("train", ["task=hovering", "compile=false", "num_envs=2", *words])
     env, actor = building.set_up(cfg)
     critic = make_value(env, **building.network(cfg, "critic", env))
     assert critic.in_keys == ["observation", *read] and critic.module.scales == (1.0, *read.values())
     assert ("recurrent_state" in actor.in_keys) == bool(read)
-    assert (
-        "recurrent_state" not in building.make_policy(compose("train", [*words, "actor.recurrent=false"]), env).in_keys
-    )
+    forgets = building.make_policy(compose("train", [*words, "actor.recurrent=false"]), env)
+    assert "recurrent_state" not in forgets.in_keys
 
 
 @cases(("mass", 1.0), ("position", "large"), ("position", None))
@@ -151,7 +134,7 @@ def test_rewards_in_any_unit_are_divided_by_the_size_of_returns_and_critics_keep
     torch.manual_seed(0)
     env = HoveringEnv(num_envs=2, seed=0)
     loss = AHACLoss(actor := make_actor(env), make_value(env))
-    scale, rollout = ReturnScale(loss), differentiable_rollout(env, actor, None, 3)[0]
+    scale, rollout = building.ReturnScale(loss), differentiable_rollout(env, actor, None, 3)[0]
     for size in (4.0, 2.0):  # of all targets, in the reward's unit
         before = scale.value
         reward = unit * torch.ones(2, 3, 1, requires_grad=True)
@@ -163,9 +146,8 @@ def test_rewards_in_any_unit_are_divided_by_the_size_of_returns_and_critics_keep
         said = loss._critics(data) * before
         scale.update(data)
         torch.testing.assert_close(loss._critics(data) * scale.value, said, rtol=1e-5, atol=1e-6 * unit)
-        torch.testing.assert_close(
-            data["value_target"].double() * scale.value, torch.full((2, 3, 1), size * unit).double()
-        )
+        targets = torch.full((2, 3, 1), size * unit).double()
+        torch.testing.assert_close(data["value_target"].double() * scale.value, targets)
     assert scale.value.item() == pytest.approx(unit * ((16 + 4) / 2) ** 0.5, rel=1e-6)
 
 
@@ -188,10 +170,8 @@ def test_a_run_levels_off_when_no_evaluation_has_risen_for_a_share_of_it():
     assert not looks_ahead(low + later, None)
     curve[7]["eval/solved"] = 1.0
     assert last_rise(curve) == 80 and last_rise([*curve, curve[-1] | {"eval/return": float("nan")}]) == 80
-    assert (
-        last_rise([*curve, curve[0] | {"eval/return": -math.inf}, {**curve[-1], "steps": 120, "eval/return": 99}])
-        == 120
-    )
+    again = [curve[0] | {"eval/return": -math.inf}, curve[-1] | {"steps": 120, "eval/return": 99}]
+    assert last_rise([*curve, *again]) == 120
     offset = [row | {"eval/return": row["eval/return"] + 1000.0} for row in curve]  # 1 % of the return itself
     assert last_rise(offset[:7]) == 20
 
@@ -207,7 +187,7 @@ def test_a_run_levels_off_when_no_evaluation_has_risen_for_a_share_of_it():
 )
 def test_a_run_has_lost_its_way_where_it_solves_a_third_less_and_its_return_fell(lost, solved, returns):
     rows = [{"eval/solved": x, "eval/return": y} for x, y in zip(solved, returns, strict=True)]
-    assert has_lost_its_way(rows, 0.5) == lost and not has_lost_its_way(rows, None)
+    assert [evaluation.has_lost_its_way(rows, patience) for patience in (0.5, None)] == [lost, False]
 
 
 def test_the_best_policy_solves_most_and_with_a_patience_to_the_nearest_2_percent_and_half_at_least():

@@ -60,16 +60,14 @@ def test_a_drone_comes_from_a_file_or_a_mapping_as_well(tmp_path):
     ({"rotor_spin": [1, 1, 0, -1]}, r"mine.yaml: field 'rotor_spin' must be \+1 or -1"),
     ({"inertia": [1e-3, 1e-3, 2.1e-3]}, r"inertia \[0.001, 0.001, 0.0021\] kg m2: in a body none .* exceeds the sum"),
     ({"inertia": [0.02, 0.02, 0.03]}, r"it is that of a ring of 0.255 m radius, and the farthest rotor is 0.075 m"),
-    (
-        {"rotor_positions": [[5.3, 5.3], [-5.3, 5.3], [-5.3, -5.3], [5.3, -5.3]]},
-        r"a ring of 0.0664 m radius, and the farthest rotor is 7.5 m from .*; mass is in kg, rotor_positions in m",
-    ),
+    ({"rotor_positions": [[5.3, 5.3], [-5.3, 5.3], [-5.3, -5.3], [5.3, -5.3]]},
+        r"a ring of 0.0664 m radius, and the farthest rotor is 7.5 m from .*; mass is in kg, rotor_positions in m"),
     ({"thrust_map": [-1e-6, 5e-3, 0.0]}, r"must rise .* is \[0.0046\] at rotor_speed_min and \[-0.002\] at"),
     ({"thrust_map": [0.0, 1e-3, 0.0]}, r"thrust_map must bend, .* k2 is \[0.0\]. Write 3.1e-10, which"),
     ({"mass": "1:59:59"}, r"mine.yaml: field 'mass' is not a number or a list of numbers: '1:59:59'"),
     ({"thrust_map": [4e-7, -5e-3, 0.0]}, r"thrust_map must rise with rotor speed"),
     ({"rotor_speed_min": 4000.0}, r"rotor_speed_min must be below rotor_speed_max, got \[4000.0\] and \[3500.0\]"),
-)
+)  # fmt: skip
 def test_a_bad_file_is_refused_with_its_field_and_what_is_allowed(change, message, tmp_path):
     path = tmp_path / "mine.yaml"
     values = {name: value for name, value in {**VISFLY, **change}.items() if value is not None}
@@ -101,15 +99,9 @@ def test_gradients_flow_through_replace_to_and_construction_and_a_drone_in_float
     QuadrotorParams(**params.fields()).mass.sum().backward()
     assert (mass.grad == 1.0).all() and params.mass.shape == (5, 1)
     assert not params.detach().mass.requires_grad
-    drone = {
-        **VISFLY,
-        "mass": 0.027,
-        "inertia": [1e-8] * 3,
-        "rotor_positions": [[1e-3, 1e-3], [-1e-3, 1e-3], [-1e-3, -1e-3], [1e-3, -1e-3]],
-        "yaw_torque_coefficient": 1e-5,
-        "rate_gain": [20.0] * 3,
-        "rate_damping": [0.0] * 3,
-    }
+    drone = {**VISFLY, "mass": 0.027, "inertia": [1e-8] * 3, "rate_gain": [20.0] * 3, "rate_damping": [0.0] * 3}
+    drone["rotor_positions"] = [[1e-3, 1e-3], [-1e-3, 1e-3], [-1e-3, -1e-3], [1e-3, -1e-3]]
+    drone["yaw_torque_coefficient"] = 1e-5
     env = HoveringEnv(num_envs=1, drone=drone, dtype=torch.float64)
     assert (env.params.mass.item(), env.params.inertia[..., 0].item()) == (0.027, 1e-8)
     rounded = load_drone(drone, torch.float32)  # whose 1e-8 is a little less

@@ -53,10 +53,8 @@ def test_an_unknown_option_is_refused_with_the_closest_one_and_all_of_them():
     ({"event_discount": "gamma"}, "got 'gamma'. The discount .*; None for no gradient in it."),
     ({"drone": visfly.replace(mass=4.6)}, r"to hover, its rotors would have to turn at .* Check mass \[kg\]"),
     ({"drone": visfly.replace(max_thrust_to_weight=0.8)}, "max_thrust_to_weight .* must be above 1 to hover; got"),
-    (
-        {"drone": visfly.replace(rotor_positions=[[0.1 * i, 0.03 * i] for i in (-3, -1, 1, 3)])},
-        "its 4 rotors cannot control roll and pitch independently. It takes four or more with a torque about each axis",
-    ),
+    ({"drone": visfly.replace(rotor_positions=[[0.1 * i, 0.03 * i] for i in (-3, -1, 1, 3)])},
+        "its 4 rotors cannot control roll and pitch independently. It takes four or more with a torque about each"),
     ({"drone": None}, "drone must be the name of a preset, .* or QuadrotorParams, got None"),
     ({"auto_reset": True}, "auto_reset=True is for environments that reset themselves"),
     ({"dtype": torch.int32}, "dtype must be torch.float32 or torch.float64"),
@@ -70,7 +68,7 @@ def test_an_unknown_option_is_refused_with_the_closest_one_and_all_of_them():
     ({"observation_noise": {"delay": 1}}, "observation_noise: unknown key 'delay'"),
     ({"observation_delay": -1}, "observation_delay must be at least 0, got -1. Control steps by which"),
     ({"random_start": {"tilt": float("nan")}}, "random_start: tilt must be a finite number, got nan"),
-)
+)  # fmt: skip
 def test_a_bad_value_is_refused_by_name(kwargs, message):
     refuses(message, HoveringEnv, **kwargs)
 
@@ -98,18 +96,12 @@ def test_a_bad_value_is_refused_by_name(kwargs, message):
     ("events", lambda _, p, s: {"near": near(s, term="gate")}, "term must be one of survival, .*; got 'gate'"),
     ("initial_state", adding(legs=torch.zeros(4)), r"'legs' must be a tensor \(4, ...\) of at least two .*\(4,\)"),
     ("initial_state", adding(step=torch.zeros(4, 1)), "entry 'step' is the environment's own; give yours another"),
-    (
-        "initial_state",
-        lambda env, n: {**HoveringEnv.initial_state(env, n), "legs": torch.rand(n, 1)},
-        "initial_state: 'legs' differs between calls with one seed. Draw from self.uniform",
-    ),
-    (
-        "initial_state",
-        lambda env, n: env.hover_state(torch.zeros(n, 3))["step"],
-        "initial_state asks for 'step', which hover_state does not give: it has position, ",
-    ),
+    ("initial_state", lambda env, n: {**HoveringEnv.initial_state(env, n), "legs": torch.rand(n, 1)},
+        "initial_state: 'legs' differs between calls with one seed. Draw from self.uniform"),
+    ("initial_state", lambda env, n: env.hover_state(torch.zeros(n, 3))["step"],
+        "initial_state asks for 'step', which hover_state does not give: it has position, "),
     ("initial_state", adding(legs=torch.zeros(4, 1).int()), r"'legs' must be .* int64 or bool; got .* torch.int32\)"),
-)
+)  # fmt: skip
 def test_a_task_of_another_form_is_refused_by_the_name_of_its_method(method, wrong, message):
     with pytest.raises(ValueError, match="OwnEnv." + (message if message.startswith(method) else ".*" + message)):
         type("OwnEnv", (HoveringEnv,), {method: wrong})(num_envs=4)

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from flying import fly
+from refusals import cases
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
@@ -196,16 +197,13 @@ def test_the_audit_says_that_a_term_has_a_gradient_in_time_only(task):
     assert row.split()[1] == "0" and row.endswith("%  gradient in time only")
 
 
-@pytest.mark.parametrize(
-    "options", [{}, {"dynamics": "point_mass"}, {"wind": {"gust": 3.0}, "randomize": {"mass": {"scale": [0.8, 1.2]}}}]
-)
+@cases(({},), ({"dynamics": "point_mass"},), ({"wind": {"gust": 3.0}, "randomize": {"mass": {"scale": [0.8, 1.2]}}},))
 @each_task
-def test_tumbling_and_standing_drones_have_finite_gradients_and_specs_hold(task, options):
+def test_tumbling_and_standing_drones_have_finite_gradients_and_specs_hold(options, task):
     task_options = {"track": GATES} if task == "gates" else {}
     name = "landing" if task == "landing" else "racing"
-    check_env_specs(
-        make_env(name, num_envs=2, event_discount=0.99, **task_options, **options), break_when_any_done="both"
-    )
+    env = make_env(name, num_envs=2, event_discount=0.99, **task_options, **options)
+    check_env_specs(env, break_when_any_done="both")
     env, state = STARTS[task](event_discount=0.99, **options)
     state["velocity"][0] = 0.0
     inputs = [state["position"].requires_grad_(), state["velocity"].requires_grad_()]

@@ -75,13 +75,8 @@ def test_steps_that_a_collector_masks_do_not_count(env64):
     rollout, _ = differentiable_rollout(env64, actor, None, 6)
     counts = torch.ones(4, 6, dtype=torch.bool)
     every = masked(rollout, counts)
-    for loss in (
-        BPTTLoss(actor, alpha=0.1),
-        SHACLoss(actor, value),
-        ABPTLoss(actor, qvalue),
-        ABPTLoss(actor, qvalue, simulated_steps=2),
-        SAPOLoss(actor, value, alpha=0.1),
-    ):
+    abpt = ABPTLoss(actor, qvalue), ABPTLoss(actor, qvalue, simulated_steps=2)
+    for loss in (BPTTLoss(actor, alpha=0.1), SHACLoss(actor, value), *abpt, SAPOLoss(actor, value, alpha=0.1)):
         hidden = masked(rollout, counts & (torch.arange(4) > 0).unsqueeze(1))
         out, without = (seeded(loss, flight) for flight in (hidden, rollout[1:]))
         torch.testing.assert_close(4 * out["loss_actor"], 3 * without["loss_actor"])

@@ -24,6 +24,10 @@ search = settings(max_examples=25, deadline=None, derandomize=True, database=Non
 each_task = pytest.mark.parametrize("task", TASKS)
 
 
+def on_each_task(**drawn):
+    return lambda test: each_task(search(given(**drawn)(test)))
+
+
 @cache
 def env_of(task, dtype=torch.float64):
     open_ground = {"density": 0.0} if task == "forest" else {}  # states are drawn where trees would stand, too
@@ -92,9 +96,7 @@ def equal(one, other):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@each_task
-@search
-@given(flight=flights(calm=False))
+@on_each_task(flight=flights(calm=False))
 def test_a_step_from_anywhere_is_finite_and_so_are_its_derivatives(task, dtype, flight):
     env = env_of(task, dtype)
     td = start(env, flight)
@@ -109,9 +111,7 @@ def test_a_step_from_anywhere_is_finite_and_so_are_its_derivatives(task, dtype, 
     torch.testing.assert_close(unit, torch.ones_like(unit), atol=1e-5, rtol=0)
 
 
-@each_task
-@search
-@given(flight=flights(calm=False))
+@on_each_task(flight=flights(calm=False))
 def test_rewards_are_the_sum_of_their_terms_and_flags_agree_and_the_specs_contain_what_is_made(task, flight):
     env = env_of(task)
     ends = step(env, start(env, flight))
@@ -125,9 +125,7 @@ def test_rewards_are_the_sum_of_their_terms_and_flags_agree_and_the_specs_contai
             assert spec.is_in(made.select(*spec.keys()))
 
 
-@each_task
-@search
-@given(flight=flights(calm=False))
+@on_each_task(flight=flights(calm=False))
 def test_a_step_is_a_pure_function_of_its_input(task, flight):
     env = env_of(task)
     td = start(env, flight)
@@ -143,9 +141,7 @@ def has_sense(td):
     return torch.stack([(td["state", name].abs() <= bound).all(-1) for name, bound in bounds.items()]).all(0)
 
 
-@each_task
-@search
-@given(flight=st.one_of(flights(), flights(calm=False)))
+@on_each_task(flight=st.one_of(flights(), flights(calm=False)))
 def test_a_reset_to_a_state_restores_it_to_the_last_bit_or_refuses_it(task, flight):
     env = env_of(task)
     td = start(env, flight)
@@ -159,9 +155,7 @@ def test_a_reset_to_a_state_restores_it_to_the_last_bit_or_refuses_it(task, flig
         assert equal(leaves(env.reset(chosen, set_state=True)["state"]), leaves(td["state"]))
 
 
-@each_task
-@search
-@given(flight=flights())
+@on_each_task(flight=flights())
 def test_two_quaternions_of_one_attitude_fly_alike(task, flight):
     env = env_of(task)
     td = start(env, flight)
@@ -177,9 +171,7 @@ def test_two_quaternions_of_one_attitude_fly_alike(task, flight):
     torch.testing.assert_close(seen[:, 3:], up)
 
 
-@each_task
-@search
-@given(flight=flights(), order=st.permutations(range(N)))
+@on_each_task(flight=flights(), order=st.permutations(range(N)))
 def test_the_order_of_the_environments_is_that_of_the_results(task, flight, order):
     env = env_of(task)
     td = start(env, flight)
@@ -233,9 +225,7 @@ def test_actions_beyond_their_bounds_are_clamped_and_rotors_keep_their_limits(fl
     assert (speed <= env.nominal.rotor_speed_max * (1 + 1e-12)).all()
 
 
-@each_task
-@search
-@given(flight=flights())
+@on_each_task(flight=flights())
 def test_the_hover_action_holds_any_place_and_heading(task, flight):
     env = env_of(task)
     td = start(env, flight)

@@ -15,25 +15,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 
-from torchrl_quad import (
-    ABPTLoss,
-    AHACLoss,
-    BPTTLoss,
-    ForestEnv,
-    HoveringEnv,
-    HybridLoss,
-    SAPOLoss,
-    SHACLoss,
-    TrustRegion,
-    VisitedStateBuffer,
-    differentiable_rollout,
-    make_actor,
-    make_qvalue,
-    make_value,
-    make_visual_actor,
-    restart,
-)
-from torchrl_quad.data import flight_mode
+from torchrl_quad import ForestEnv, HoveringEnv, TrustRegion, VisitedStateBuffer
+from torchrl_quad.data import differentiable_rollout, flight_mode, restart
+from torchrl_quad.modules import make_actor, make_qvalue, make_value, make_visual_actor
+from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss
 
 CAMERA = {"width": 6, "height": 4}
 SMALL = {"channels": (2,), "num_cells": (5,), "hidden_size": 3}
@@ -64,9 +49,8 @@ def test_the_gradient_goes_through_the_memory():
     fly.actor, fly.forward = actor, lambda: differentiable_rollout(env, actor, start, 6, exploration_type=MODE)[0]
 
     def value(shift):
-        flight = functional_call(
-            fly, {f"actor.{name}": x + shift * direction.get(name, 0.0) for name, x in names.items()}
-        )
+        moved = {f"actor.{name}": x + shift * direction.get(name, 0.0) for name, x in names.items()}
+        flight = functional_call(fly, moved)
         return flight["next", "observation"][:, -1].square().sum() + flight["next", MEMORY][:, -1].sum()
 
     grads = torch.autograd.grad(value(torch.zeros(())), [names[name] for name in direction])

@@ -53,6 +53,15 @@ def pushed(env, actor, at, push):
         return EnvBase.rollout(anew(env), 9, policy, auto_cast_to_device=False, break_when_any_done=False)
 
 
+def on_plain_tensors(actor, td, kind=ExplorationType.RANDOM):
+    """What an actor writes, its form on plain tensors, and the noise that was drawn."""
+    with set_exploration_type(kind):
+        torch.manual_seed(3)
+        written, plain = actor(td.copy()), actor.plain()
+        torch.manual_seed(3)
+        return written, plain, plain.drawn(1, len(td), {})[0]
+
+
 def look_at_nothing(patch):
     """Let the code believe that its tensors are on an accelerator, which it must not wait for."""
     for name in ("engine.horizon", "envs.randomness", "envs.guard"):

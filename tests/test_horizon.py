@@ -4,27 +4,19 @@ import copy
 
 import pytest
 import torch
-from flying import Looks, anew, look_at_nothing
-from refusals import refuses
+from flying import Looks, anew, look_at_nothing, on_plain_tensors
+from refusals import cases, refuses
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torch._dynamo.utils import counters
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_quad import (
-    ActionSequence,
-    BPTTLoss,
-    HoveringEnv,
-    RacingEnv,
-    audit_reward,
-    differentiable_rollout,
-    make_actor,
-    make_env,
-)
+from torchrl_quad import ActionSequence, BPTTLoss, HoveringEnv, RacingEnv, audit_reward, differentiable_rollout
 from torchrl_quad.dynamics import DYNAMICS, PointMass
-from torchrl_quad.envs import TASKS
+from torchrl_quad.envs import TASKS, make_env
 from torchrl_quad.errors import Unsupported
+from torchrl_quad.modules import make_actor
 
 EVERYTHING = {
     "action_delay": 2,
@@ -260,28 +252,20 @@ def test_cuda_graphs_are_refused_since_a_horizon_keeps_all_of_its_steps(options)
 
 
 @pytest.mark.parametrize("kind", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"return_log_prob": True},
-        {"activation": nn.Tanh, "in_keys": ["observation", ("state", "velocity")], "input_scale": (1.0, 0.3)},
-        {"activation": nn.SiLU, "num_cells": (16,), "action_init": torch.full((4,), 0.2)},
-    ],
+@cases(
+    ({},),
+    ({"activation": nn.Tanh, "in_keys": ["observation", ("state", "velocity")], "input_scale": (1.0, 0.3)},),
+    ({"activation": nn.SiLU, "num_cells": (16,), "action_init": torch.full((4,), 0.2)},),
 )
-def test_a_policy_on_plain_tensors_is_the_policy(env64, options, kind):
-    actor = make_actor(env64, **{"return_log_prob": True, **options})
+def test_a_policy_on_plain_tensors_is_the_policy(options, kind, env64):
+    actor = make_actor(env64, return_log_prob=True, **options)
     for parameter in actor.parameters():
         parameter.data += 0.1 * torch.randn_like(parameter)
-    with set_exploration_type(kind):
-        plain = actor.plain()
-        torch.manual_seed(3)
-        td = env64.reset()
-        inputs = [td[key].requires_grad_() for key in plain.in_keys]
-        written = actor(td.copy()).select(*plain.out_keys)
-        torch.manual_seed(3)
-        drawn = plain.drawn(1, 4, {})[0]
+    td = env64.reset()
+    inputs = [td[key].requires_grad_() for key in actor.in_keys]
+    written, plain, drawn = on_plain_tensors(actor, td, kind)
     kept, mine = plain.forward(plain.weights, inputs, drawn)
-    torch.testing.assert_close(mine, dict(written.items()))
+    torch.testing.assert_close(mine, {key: written[key] for key in plain.out_keys})
     grads = {key: torch.randn_like(x) for key, x in mine.items()}
     total = sum((written[key] * grads[key]).sum() for key in grads)
     expected = torch.autograd.grad(total, [*inputs, *plain.weights])
@@ -293,10 +277,9 @@ def test_a_policy_on_plain_tensors_is_the_policy(env64, options, kind):
 def test_a_saturated_policy_keeps_the_gradient_that_torchrl_gives(env):
     actor = make_actor(env, return_log_prob=True)
     actor[0].module.mlp[-1].bias.data += 12.0
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        plain, td = actor.plain(), env.reset()
-        written, weights = actor(td.copy()), list(plain.weights)
-        mine = plain.forward(plain.weights, [td["observation"]], plain.drawn(1, 4, {})[0])[1]
+    td = env.reset()
+    written, plain, drawn = on_plain_tensors(actor, td, ExplorationType.DETERMINISTIC)
+    weights, mine = list(plain.weights), plain.forward(plain.weights, [td["observation"]], drawn)[1]
     assert (written["action"] > 0.999).all()
     for key in ("action", "action_log_prob"):
         torch.testing.assert_close(mine[key], written[key])

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from flying import anew
+from flying import anew, on_plain_tensors
 from refusals import cases, refuses
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
@@ -56,11 +56,7 @@ def test_the_first_action_can_be_chosen_and_is_the_middle_of_the_range_or_the_me
 def test_an_action_with_bounds_of_its_own_is_a_tanh_gaussian_between_them(rho):
     actor = make_actor(make_pendulum(), return_log_prob=True, scale_init=0.3, noise_correlation=rho)
     td = TensorDict({"observation": torch.randn(5, 2)}, [5])
-    with set_exploration_type(ExplorationType.RANDOM):
-        torch.manual_seed(3)
-        written, plain = actor(td.copy()), actor.plain()
-        torch.manual_seed(3)
-        drawn = plain.drawn(1, 5, {})[0]
+    written, plain, drawn = on_plain_tensors(actor, td)
     pure = plain.forward(plain.weights, [td["observation"]], drawn)[1]
     assert {"loc", "scale", "action", "action_log_prob"} <= set(pure)
     torch.testing.assert_close({key: written[key] for key in pure}, pure)
@@ -206,11 +202,7 @@ def test_called_or_not_the_noise_is_the_same_also_where_the_action_is_saturated(
     actor[0].module.mlp[-1].bias.data[:4] = bias
     td = env64.reset()
     for kind in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC):
-        torch.manual_seed(3)
-        with set_exploration_type(kind):
-            written, plain = actor(td.copy()), actor.plain()
-        torch.manual_seed(3)
-        drawn = plain.drawn(1, 4, {})[0]
+        written, plain, drawn = on_plain_tensors(actor, td, kind)
         mine = plain.forward(plain.weights, [td["observation"]], drawn)[1]
         torch.testing.assert_close({key: written[key] for key in mine}, mine)
         torch.testing.assert_close(plain.drawn_again(written), drawn)

@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-from flying import anew
+from flying import anew, on_plain_tensors
 from refusals import refuses
 from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv, VecNormV2, check_env_specs
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs.utils import ExplorationType
 
 from torchrl_quad import HoveringEnv, ObservationNormalizer, differentiable_rollout, make_actor
 from torchrl_quad.data.transforms import normalized
@@ -86,11 +86,9 @@ def test_a_normalized_policy_on_plain_tensors_is_the_policy():
     normalizer = ObservationNormalizer(env)
     normalizer.update(env.rollout(20))
     actor = make_actor(env, in_keys=[("state", "velocity"), "observation"], input_scale=(0.3, 0.7))
-    policy, td = normalized(actor, normalizer), env.reset()
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        plain, written = policy.plain(), policy(td.copy())
-        inputs = [td[key] for key in plain.in_keys]
-        _, mine = plain.forward(plain.weights, inputs, plain.drawn(1, 4, {})[0])
+    td = env.reset()
+    written, plain, drawn = on_plain_tensors(normalized(actor, normalizer), td, ExplorationType.DETERMINISTIC)
+    _, mine = plain.forward(plain.weights, [td[key] for key in plain.in_keys], drawn)
     torch.testing.assert_close(mine["action"], written["action"])
     expected, found = (torch.autograd.grad(x["action"].sum(), list(actor.parameters())) for x in (written, mine))
     torch.testing.assert_close(found, expected)

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from refusals import cases
+from refusals import cases, refuses
 
 from torchrl_quad.files import machine, read_rows
 
@@ -106,15 +106,12 @@ def test_the_benchmark_of_a_gpu_runs_on_the_cpu_writes_each_row_and_names_what_f
     assert late == ["no time left"] * 4
 
 
-@pytest.mark.parametrize(
-    ("program", "said"), [("exit('Error: no.')", "1: Error: no."), ("import os; os._exit(3)", "3: ")]
-)
+@cases(("exit('Error: no.')", "1: Error: no."), ("import os; os._exit(3)", "3: "))
 def test_a_recipe_that_fails_is_not_one_that_never_solves(program, said, monkeypatch, tmp_path):
     module = importlib.import_module("benchmarks.time_to_solve")
     monkeypatch.setattr(module, "RECIPES", tmp_path)
     (tmp_path / "bptt.py").write_text(program)
-    with pytest.raises(RuntimeError, match=f"^bptt ended with {said}$"):
-        module.solve("bptt", 0, [], tmp_path)
+    refuses(f"^bptt ended with {said}$", module.solve, "bptt", 0, [], tmp_path, error=RuntimeError)
     (tmp_path / "bptt.py").write_text("")
     assert module.solve("bptt", 0, [], tmp_path) is None
 

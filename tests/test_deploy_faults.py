@@ -136,10 +136,8 @@ def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch, trace_once):
 
     module = TensorDictModule(nn.Linear(13, 4), in_keys=["observation"], out_keys=["action"])
     refuses("exports what make_actor and make_visual_actor build, .* This TensorDictModule is something else", module)
-    refuses(
-        r"reads \['observation', \('state', 'rotor_speed'\)\]. A drone only has",
-        make_actor(env, in_keys=["observation", ("state", "rotor_speed")]),
-    )
+    knows = make_actor(env, in_keys=["observation", ("state", "rotor_speed")])
+    refuses(r"reads \['observation', \('state', 'rotor_speed'\)\]. A drone only has", knows)
     leaky = make_actor(env)
     leaky[0].module.mlp[1] = nn.LeakyReLU(0.2)
     refuses(r"cannot write LeakyReLU\(negative_slope=0.2\)", leaky)

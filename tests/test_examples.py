@@ -26,16 +26,12 @@ def reduced(program):
 
 @pytest.mark.usefixtures("quick_fits")
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
-def test_every_example_runs(example, tmp_path, monkeypatch):
+def test_every_example_is_short_and_runs(example, tmp_path, monkeypatch):
+    assert len(example.read_text().splitlines()) < 60
     small = tmp_path / example.name
     small.write_text(reduced(example.read_text()))
     monkeypatch.chdir(tmp_path)
     runpy.run_path(str(small), run_name="__main__")
-
-
-@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
-def test_every_example_is_short(example):
-    assert len(example.read_text().splitlines()) < 60
 
 
 TASKS = sorted((EXAMPLES[0].parent / "tasks").glob("*.py"))

@@ -18,18 +18,8 @@ from torchrl_quad import HoveringEnv, load_drone
 from torchrl_quad.deploy import frames
 from torchrl_quad.dynamics import MotorCommand
 from torchrl_quad.errors import UserError, UserValueError
-from torchrl_quad.identification import (
-    LAYOUTS,
-    Columns,
-    NoFlight,
-    TooShort,
-    estimation,
-    fitting,
-    identify,
-    prediction,
-    read_log,
-)
-from torchrl_quad.identification.errors import WrongFrame, WrongQuaternion, WrongUnit
+from torchrl_quad.identification import LAYOUTS, Columns, estimation, fitting, identify, prediction, read_log
+from torchrl_quad.identification.errors import NoFlight, TooShort, WrongFrame, WrongQuaternion, WrongUnit
 from torchrl_quad.identification.parameters import UNKNOWNS, Model
 from torchrl_quad.identification.prediction import prediction_error
 

@@ -72,10 +72,8 @@ def finish(folder):
     (folder / "summary.json").write_text('{"return": 2.5, "solved": 0.1, "steps": 10, "revision": "abc"}')
 
 
-@pytest.mark.parametrize(
-    "what", ["trial --quick", "ablations --quick", "forest --forests 2", "shipped --tasks six_gates"]
-)
-def test_results_that_do_not_ship_never_get_among_those_that_do(monkeypatch, capsys, what):
+@cases(("trial --quick",), ("ablations --quick",), ("forest --forests 2",), ("shipped --tasks six_gates",))
+def test_results_that_do_not_ship_never_get_among_those_that_do(what, monkeypatch, capsys):
     with pytest.raises(SystemExit):
         run_main(monkeypatch, reproduce, what)
     assert "name another folder with --data" in capsys.readouterr().err

@@ -14,24 +14,15 @@ from functools import partial
 
 import pytest
 import torch
-from refusals import refuses
+from refusals import cases, refuses
 from tensordict import assert_close
 from test_bounded_steps import LOSSES
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from torchrl.collectors import Collector, MultiCollector
 from torchrl.data import Unbounded
-from torchrl.envs import (
-    AsyncEnvPool,
-    Compose,
-    EnvCreator,
-    ParallelEnv,
-    RewardSum,
-    SerialEnv,
-    StepCounter,
-    TransformedEnv,
-    check_env_specs,
-)
+from torchrl.envs import AsyncEnvPool, EnvCreator, ParallelEnv, SerialEnv, check_env_specs
 from torchrl.envs import transforms as of_torchrl
+from torchrl.envs.transforms import Compose, RewardSum, StepCounter, TransformedEnv
 from torchrl.envs.utils import ExplorationType, step_mdp
 from torchrl.objectives import SoftUpdate
 
@@ -119,9 +110,7 @@ def processes():
     multiprocessing.set_start_method(None, force=True)
 
 
-@pytest.mark.parametrize(
-    ("task", "name"), [("hovering", x) for x in (*BEFORE_THE_POLICY, *PRECISION)] + [(x, "all") for x in TASKS]
-)
+@cases(*(("hovering", x) for x in (*BEFORE_THE_POLICY, *PRECISION)), *((x, "all") for x in TASKS))
 def test_specs_hold_under_transforms(task, name):
     transforms = {**BEFORE_THE_POLICY, **PRECISION}[name]()
     env = TransformedEnv(make_env(task, num_envs=2, dtype=torch.float64), Compose(*transforms))

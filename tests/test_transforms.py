@@ -220,9 +220,8 @@ def test_of_what_a_policy_reads_the_image_alone_has_no_gradient_whatever_it_is_c
 
 
 def test_the_first_step_reads_what_the_start_says():
-    env = TransformedEnv(
-        HoveringEnv(num_envs=2, dtype=torch.float64), Compose(normalizer(), ExcludeTransform("success"))
-    )
+    base = HoveringEnv(num_envs=2, dtype=torch.float64)
+    env = TransformedEnv(base, Compose(normalizer(), ExcludeTransform("success")))
     start, actor = env.reset(), make_actor(env, (8,))
     start["observation"] = start["observation"] + 1.0
     rollout, _ = differentiable_rollout(env, actor, start, 2, exploration_type=ExplorationType.DETERMINISTIC)

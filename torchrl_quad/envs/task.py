@@ -213,11 +213,7 @@ def check_task(env: Task, state: State) -> None:
     task, n = type(env).__name__, env.num_envs
 
     def check(condition: bool, message: str) -> None:
-        if not condition:
-            raise UserValueError(f"{task}.{message}")
-
-    def kind(x: object) -> str:
-        return f"{tuple(x.shape)}, {x.dtype}" if isinstance(x, Tensor) else type(x).__name__
+        _check(condition, f"{task}.{message}")
 
     def check_tensor(method: str, x: Any, dtype: torch.dtype | None, columns: int | None = 1) -> None:
         is_right = isinstance(x, Tensor) and x.shape == (n, columns or x.shape[-1:].numel())
@@ -229,7 +225,7 @@ def check_task(env: Task, state: State) -> None:
         elif method.startswith("reward") and isinstance(x, Tensor):
             hint = " Keep the last dimension: norm(x) of envs.terms, or .sum(-1, keepdim=True)."
         hint = " Convert it: .to(self.dtype)." if is_right and dtype == env.dtype else hint
-        check(is_right and dtype in (None, x.dtype), f"{method} must be a tensor {wanted}; got {kind(x)}.{hint}")
+        check(is_right and dtype in (None, x.dtype), f"{method} must be a tensor {wanted}; got {_kind(x)}.{hint}")
 
     def call(name: str, *states: State) -> Any:
         """What a method returns of states, into which it must not write: the physics goes on from them."""
@@ -242,11 +238,8 @@ def check_task(env: Task, state: State) -> None:
                 f"{', '.join(map(str, states[0]))}."
             ) from error
         for key, x, version in before:
-            check(
-                x._version == version,
-                f"{name} writes into {key!r} in place, which changes the flight itself. Write x = x.clone() first, or "
-                "use torch.where.",
-            )
+            changes = f"{name} writes into {key!r} in place, which changes the flight itself."
+            check(x._version == version, f"{changes} Write x = x.clone() first, or use torch.where.")
         return found
 
     def named(method: str, entries: Any) -> Iterator[tuple[str, Any]]:
@@ -259,18 +252,16 @@ def check_task(env: Task, state: State) -> None:
         twice.append(env.initial_state(n))
         env.randomness.set_state(random)
     for key, x in twice[0].items():
-        other = twice[1].get(key)
-        same = isinstance(x, Tensor) and isinstance(other, Tensor) and x.shape == other.shape
-        again = not isinstance(x, Tensor) or (same and torch.allclose(x, other, equal_nan=True))
-        check(
-            again,
-            f"initial_state: {key!r} differs between calls with one seed. Draw from self.uniform, and count nothing.",
-        )
+        same = _kind(x) == _kind(other := twice[1].get(key))
+        again = same and (not isinstance(x, Tensor) or torch.allclose(x, other, equal_nan=True))
+        mend = "Draw from self.uniform, and count nothing."
+        check(again, f"initial_state: {key!r} differs between calls with one seed. {mend}")
     taken = {"step", "action_queue", "collided", "drone", "scene"}
     starts = {key: type(x).__name__ for x in env.disturbances.values() for key in x.start(env.randomness, state)}
     taken |= {key for key in starts if isinstance(key, str)}
-    for key in taken & set(env.task_entries):
-        check(False, f"initial_state: entry {key!r} is the environment's own; give yours another name.")
+    for key in env.task_entries:
+        own = f"initial_state: entry {key!r} is the environment's own; give yours another name."
+        check(key not in taken, own)
     fields, kinds = env.dynamics.plant_fields, (env.dtype, torch.int64, torch.bool)
     check_changes(env, state)
     for key, x in state.items():
@@ -278,7 +269,7 @@ def check_task(env: Task, state: State) -> None:
         check(
             isinstance(x, Tensor) and x.dim() > 1 and len(x) == n and x.dtype in kinds,
             f"{entry} must be a tensor ({n}, ...) of at least two dimensions, {env.dtype}, int64 or bool; got "
-            f"({kind(x)}).",
+            f"({_kind(x)}).",
         )
         if size := env.dynamics.sizes.get(key):
             check(x.shape == (n, size), f"{entry} must have shape {(n, size)}, got {tuple(x.shape)}.")
@@ -318,48 +309,44 @@ def check_task(env: Task, state: State) -> None:
         check_tensor(f"{method}(state)", call(method, state), torch.bool)
     advanced = call("advance", state, state)
     named("advance(previous, state)", advanced)
-    for key in advanced.keys() - state.keys():
-        check(
-            False,
-            f"advance gives {key!r}, which the state lacks and would lose. Give it in initial_state, too.",
-        )
+    for key in advanced:
+        lost = f"advance gives {key!r}, which the state lacks and would lose. Give it in initial_state, too."
+        check(key in state, lost)
     for key in env.task_entries:
-        got, wanted = kind(advanced.get(key)), kind(state[key])
-        check(
-            got == wanted,
-            f"advance must return the whole state, and {key!r} as initial_state gives it, ({wanted}); got ({got}). "
-            "Start from {**state, ...}.",
-        )
+        got, wanted = _kind(advanced.get(key)), _kind(state[key])
+        whole = f"advance must return the whole state, and {key!r} as initial_state gives it, ({wanted}); got ({got})."
+        check(got == wanted, f"{whole} Start from {{**state, ...}}.")
 
 
 def check_changes(env: Task, state: State) -> None:
     """Check that disturbances change what their ``start`` gives or the drone has, and nothing that the physics sets."""
-    commanded = getattr(env.dynamics, "commanded", ())
     for disturbance in env.disturbances.values():
+        who = type(disturbance).__name__
         noise = state["position"].new_zeros(env.num_envs, disturbance.noise_size) if disturbance.noise_size else None
-        who = f"{type(disturbance).__name__}.advance"
-        changed = disturbance.advance(dict(state), noise, env.control_dt)
-        if not isinstance(changed, Mapping):
-            got = type(changed).__name__
-            raise UserValueError(f"{who} must return a mapping of the entries that it changes, or {{}}; got {got}.")
-        if not isinstance(seen := disturbance.observe(dict(state)), Mapping) or not state.keys() <= seen.keys():
-            raise UserValueError(
-                f"{type(disturbance).__name__}.observe must return the whole state. Start from {{**state, ...}}."
-            )
+        changed, seen = disturbance.advance(dict(state), noise, env.control_dt), disturbance.observe(dict(state))
+        is_right, got = isinstance(changed, Mapping), type(changed).__name__
+        _check(is_right, f"{who}.advance must return a mapping of the entries that it changes, or {{}}; got {got}.")
+        is_whole = isinstance(seen, Mapping) and state.keys() <= seen.keys()
+        _check(is_whole, f"{who}.observe must return the whole state. Start from {{**state, ...}}.")
         for key, x in changed.items():
-            if key in commanded:
-                motor = (
-                    ' A motor that fails has a ("drone", "rotor_effectiveness") of 0: give that in start and in '
-                    "advance, (num_envs, n) for n rotors."
-                )
-                raise UserValueError(
-                    f"{who} writes {key!r}, which follows the command within the next control step: the change would "
-                    f"be undone.{motor if 'rotor_effectiveness' in env.dynamics.plant_fields else ''}"
-                )
-            if key not in state:
-                raise UserValueError(
-                    f"{who} writes {key!r}, which the state lacks, so that it would be lost. Give it in start, too."
-                )
-            if x.shape != state[key].shape or x.dtype != state[key].dtype:
-                got, wanted = (f"{tuple(y.shape)}, {y.dtype}" for y in (x, state[key]))
-                raise UserValueError(f"{who} must give {key!r} as the state has it, ({wanted}); got ({got}).")
+            writes = f"{who}.advance writes {key!r}, which"
+            mend = (
+                ' A motor that fails has a ("drone", "rotor_effectiveness") of 0: give that in start and in advance, '
+                "(num_envs, n) for n rotors."
+            )
+            undone = "follows the command within the next control step: the change would be undone."
+            mend = mend if "rotor_effectiveness" in env.dynamics.plant_fields else ""
+            _check(key not in getattr(env.dynamics, "commanded", ()), f"{writes} {undone}{mend}")
+            _check(key in state, f"{writes} the state lacks, so that it would be lost. Give it in start, too.")
+            got, wanted = _kind(x), _kind(state[key])
+            given = f"{who}.advance must give {key!r} as the state has it, ({wanted}); got ({got})."
+            _check(got == wanted, given)
+
+
+def _check(condition: bool, message: str) -> None:
+    if not condition:
+        raise UserValueError(message)
+
+
+def _kind(x: object) -> str:
+    return f"{tuple(x.shape)}, {x.dtype}" if isinstance(x, Tensor) else type(x).__name__

@@ -21,7 +21,7 @@ from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.options import between, build, check_value, checked
 from torchrl_quad.vision import DepthCamera, Primitives, closest_approach, nearest
-from torchrl_quad.vision.primitives import SIZES, distances, join
+from torchrl_quad.vision.primitives import KINDS, SIZES, join
 
 TRIES = 20  # how often an obstacle that stands in a start is drawn again before it is left out
 ELSEWHERE = -1e4  # [m], the height of what is left out: outside every flight and every image
@@ -201,15 +201,13 @@ class Scene(Disturbance):
 
     def _draw_clear(self, random: Randomness, kind: str, group: dict[str, Any], points: Tensor) -> Tensor:
         """The obstacles (n, count, ...) of a group; none stands at the points (n, k, 3)."""
-        n = len(points)
-        none = {name: points.new_zeros((n, 0, size)) for name, size in SIZES.items()}
+        n, (distance, _) = len(points), KINDS[kind]
         drawn = _draw(random, kind, group, n)
         blocked = torch.zeros_like(drawn[..., 0], dtype=torch.bool)
         for tries in range(TRIES):
             if tries:
                 drawn = torch.where(blocked.unsqueeze(-1), _draw(random, kind, group, n), drawn)
-            group_only = Primitives(**{**none, kind: drawn})
-            blocked = (distances(group_only, points) < self.radius + self.clearance).any(1)
+            blocked = (distance(drawn.unsqueeze(1), points.unsqueeze(2)) < self.radius + self.clearance).any(1)
             if looks_are_free(points.device) and not blocked.any():
                 return drawn
         return left_out(drawn, blocked)

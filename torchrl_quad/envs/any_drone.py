@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,12 +12,11 @@ from torch import Tensor
 from torchrl_quad.dynamics import QuadrotorParams, presets
 from torchrl_quad.dynamics.rigid_body import Rotors, thrust_limits
 from torchrl_quad.engine.simulation import State
-from torchrl_quad.envs.disturbances import DroneRandomization
+from torchrl_quad.envs.disturbances import DroneRandomization, Pair
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.errors import UserValueError, shown
-from torchrl_quad.options import between, check_value, entries
+from torchrl_quad.options import check_value
 
-_PAIR = Annotated[Sequence[Annotated[float, between(-1e6, 1e6)]], entries(2, 2)]
 #: What is drawn, and its range; the class says what it means and where the range comes from.
 RANGES = {
     "mass": [0.02, 5.0],
@@ -178,7 +177,7 @@ def any_drone(spec: Any, layout: QuadrotorParams) -> AnyDrone | None:
 def _checked(name: str, numbers: Any, source: str) -> list[float]:
     if name not in RANGES:
         raise UserValueError(f"{source}: any draws no {shown(name)}. Choose from: {', '.join(RANGES)}.")
-    low, high = check_value(f"{source}: {name}", numbers, _PAIR, "Give two numbers, low and high.")
+    low, high = check_value(f"{source}: {name}", numbers, Pair, "Give two numbers, low and high.")
     least, most = _LIMITS[name]
     is_right = least <= low <= high <= most
     if not is_right or (name == "delay" and (low % 1 or high % 1)):

@@ -29,7 +29,7 @@ MAX_WIND = 100.0  # [m/s]
 Speed = Annotated[float, between(0.0, MAX_SPEED)]
 BodyRate = Annotated[float, between(0.0, MAX_ANGULAR_VELOCITY)]
 Angle = Annotated[float, between(0.0, math.pi)]
-_PAIR = Annotated[Sequence[Annotated[float, between(-1e6, 1e6)]], entries(2, 2)]
+Pair = Annotated[Sequence[Annotated[float, between(-1e6, 1e6)]], entries(2, 2)]
 
 
 class Disturbance:
@@ -110,7 +110,7 @@ class DroneRandomization(Disturbance):
                 )
             ((kind, numbers),) = distribution.items()
             has = f"{name} needs two numbers, {_DISTRIBUTIONS[kind]}"
-            least, most = check_value(f"{source}: {kind}", numbers, _PAIR, f"{has}.")
+            least, most = check_value(f"{source}: {kind}", numbers, Pair, f"{has}.")
             if most < (0.0 if kind == "normal" else least):
                 raise UserValueError(f"{source}: {has}; got {shown(numbers)}.")
         self.nominal = {name: nominal.value(name) for name in self.spec}

@@ -192,12 +192,9 @@ def load_track(track: str | Path | Mapping = "visfly", **settings: Any) -> dict[
     source, values = _read(track, settings)
     values = own_format(source, values)
     if unknown := [key for key in values if key not in _PARTS]:
-        known = (
-            ""
-            if {"gates", "random"} & set(values)
-            else " The help of load_track lists the other formats that it reads."
-        )
-        raise UserValueError(f"{source}: unknown key {shown(unknown[0])}. Allowed: {', '.join(_PARTS)}.{known}")
+        other = " The help of load_track lists the other formats that it reads."
+        more = "" if {"gates", "random"} & set(values) else other
+        raise UserValueError(f"{source}: unknown key {shown(unknown[0])}. Allowed: {', '.join(_PARTS)}.{more}")
     found = {key: check_value(f"{source}: {key}", values[key], *_KEYS[key]) for key in _KEYS if key in values}
     found |= {key: values[key] for key in ("scene", "notes") if key in values}
     shape = {key: found.pop(key) for key in _OPENING if key in found}

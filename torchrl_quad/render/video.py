@@ -61,9 +61,8 @@ class View:
         self.low, self.high = canvas.box(low, high)
         self.arms = (0.04 * (self.high - self.low).amax()).float() * _ARMS
 
-        self.figure = canvas.make_figure(
-            figsize=(_INCHES, _INCHES), dpi=(size + 0.01) / _INCHES
-        )  # it rounds down to pixels
+        dpi = (size + 0.01) / _INCHES  # it rounds down to pixels
+        self.figure = canvas.make_figure(figsize=(_INCHES, _INCHES), dpi=dpi)
         self.canvas: FigureCanvasAgg = self.figure.canvas  # pyrefly: ignore[bad-assignment]  as make_figure sets it
         space = canvas.add_space(self.figure, (0.0, 0.02, 0.96, 0.98))
         canvas.set_box(space, self.low, self.high, zoom=0.82)

@@ -152,7 +152,7 @@ class _Horizon(torch.autograd.Function):
         valid, saved, all_ends, entries = horizon.valid, [], [], []
         leaves = written = ()
         for t in range(horizon.steps):
-            inputs = policy.inputs(at, remembered)
+            inputs = policy_inputs(horizon.policy, step.layout, step.output_layout, at, remembered)
             kept, written = policy.forward(inputs, drawn[t], is_first=t == 0)
             noise = horizon.noise()
             step.noise_names = tuple(noise)
@@ -258,10 +258,6 @@ class _Policy:
             return grads[self.action]
         of_applied = cast(Any, self.policy).pull(kept, grads[self.action])
         return of_applied if grads[self.command] is None else of_applied + grads[self.command]
-
-    def inputs(self, at: Record, memory: Mapping[Any, Tensor]) -> list[Tensor]:
-        """What it reads."""
-        return policy_inputs(self.policy, self.step.layout, self.step.output_layout, at, memory)
 
     def forward(
         self, inputs: list[Tensor], drawn: Tensor, *, is_first: bool

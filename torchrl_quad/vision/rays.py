@@ -7,7 +7,6 @@ begins within a solid meets it at once.
 from __future__ import annotations
 
 import functools
-import types
 
 import torch
 from torch import Tensor
@@ -47,7 +46,7 @@ def cast_rays(
     solids = Primitives(*(x.detach() for x in solids))
     inputs = position.detach(), attitude.detach(), plane, *solids._replace(boxes=_with_axes(solids.boxes))
     inputs, fused = [x.contiguous() for x in inputs], fused or is_traced()
-    depth, index = (_cast if fused else _chunks)(*inputs, far=far, which=differentiable)
+    depth, index = (_cast if fused else _chunks)(*inputs[:3], inputs[3:], far=far, which=differentiable)
     return _attached(solids, position, attitude, plane, depth, index, far) if differentiable else depth
 
 
@@ -178,7 +177,7 @@ def _attached(
 
 
 def _chunks(
-    position: Tensor, attitude: Tensor, plane: Tensor, *solids: Tensor, far: float, which: bool
+    position: Tensor, attitude: Tensor, plane: Tensor, solids: list[Tensor], far: float, which: bool
 ) -> tuple[Tensor, Tensor]:
     """Eager: some scenes after the others, so that what lies between stays in the cache."""
     most = max(1, *(x.shape[1] for x in solids))
@@ -203,7 +202,7 @@ class _Kernel:
         keep = dict.fromkeys(("realize_reads_threshold", "realize_acc_reads_threshold"), 10_000)
         keep |= {"realize_opcount_threshold": 10_000, "unroll_reductions_threshold": 1}
         # All inputs of a kernel are of one kind, and the function reads nothing that could change.
-        self.call = Compiled(types.MethodType(_Kernel.cast, self), {"options": keep}).again
+        self.call = Compiled(self.cast, {"options": keep}).again
 
     def cast(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         return meet(*inputs, far=self.far, which=self.which)
@@ -215,18 +214,10 @@ _kernel = functools.lru_cache(maxsize=32)(_Kernel)  # the code of one takes some
 # A function of its own for the compiler, which would tear it apart within a step.
 @torch.library.custom_op("torchrl_quad::cast_rays", mutates_args=())
 def _cast(
-    position: Tensor,
-    attitude: Tensor,
-    plane: Tensor,
-    spheres: Tensor,
-    cylinders: Tensor,
-    boxes: Tensor,
-    planes: Tensor,
-    far: float,
-    which: bool,
+    position: Tensor, attitude: Tensor, plane: Tensor, solids: list[Tensor], far: float, which: bool
 ) -> tuple[Tensor, Tensor]:
     """The depth, and with ``which`` the solids that the rays meet, else nothing (0)."""
-    inputs = [x.contiguous() for x in (position, attitude, plane, spheres, cylinders, boxes, planes)]
+    inputs = [x.contiguous() for x in (position, attitude, plane, *solids)]
     kind = tuple((x.shape, x.dtype, x.device) for x in inputs)
     with torch.no_grad():
         depth, *index = _kernel(far, which, kind).call(*inputs)
@@ -234,6 +225,6 @@ def _cast(
 
 
 @_cast.register_fake
-def _(position, attitude, plane, spheres, cylinders, boxes, planes, far, which):
+def _(position, attitude, plane, solids, far, which):
     depth = position.new_empty(len(position), plane.shape[1])
     return depth, depth.new_empty(depth.shape if which else 0, dtype=torch.int64)

@@ -44,9 +44,10 @@ def cast_rays(
         fused: compile the rays into one loop, as a compiled step does in any case; it takes seconds the first time.
     """
     solids = Primitives(*(x.detach() for x in solids))
-    inputs = position.detach(), attitude.detach(), plane, *solids._replace(boxes=_with_axes(solids.boxes))
-    inputs, fused = [x.contiguous() for x in inputs], fused or is_traced()
-    depth, index = (_cast if fused else _chunks)(*inputs[:3], inputs[3:], far=far, which=differentiable)
+    pose = position.detach().contiguous(), attitude.detach().contiguous()
+    obstacles = [x.contiguous() for x in solids._replace(boxes=_with_axes(solids.boxes))]
+    cast = _cast if fused or is_traced() else _chunks
+    depth, index = cast(*pose, plane.contiguous(), obstacles, far=far, which=differentiable)
     return _attached(solids, position, attitude, plane, depth, index, far) if differentiable else depth
 
 

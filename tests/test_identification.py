@@ -157,7 +157,7 @@ def test_the_jacobian_of_a_fit_is_that_of_central_differences(real):
     problem = fitting.Problem(model, short, moves_streams=True, counts_push=True)
     x = model.start + 0.1 * torch.randn(len(free), dtype=torch.float64)  # where two time constants are two
     streams = torch.tensor([prediction.stream_delay(real)], dtype=torch.float64)
-    jacobian = problem.linearise(fitting.State(free, x, streams), update_scale=True).jacobian
+    _, jacobian = problem.linearise(fitting.State(free, x, streams), update_scale=True)
     assert jacobian.shape == (len(short), problem.scale.numel(), len(UNKNOWNS))
     for i, name in enumerate(UNKNOWNS):
         step = 1e-5 * torch.eye(len(UNKNOWNS), dtype=torch.float64)[i]

@@ -22,7 +22,7 @@ from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.files import replacing
 from torchrl_quad.identification import prediction
 from torchrl_quad.identification.errors import TooShort
-from torchrl_quad.identification.fitting import MAX_ITERATIONS, Linear, Problem, State, bootstrap, covariance, minimise
+from torchrl_quad.identification.fitting import MAX_ITERATIONS, Problem, State, bootstrap, covariance, minimise
 from torchrl_quad.identification.log import FlightLog
 from torchrl_quad.identification.motor_checks import turning_fits
 from torchrl_quad.identification.parameters import FIELDS, NEED_MASS, UNKNOWNS, Estimate, Model, report, unknowns_of
@@ -111,7 +111,7 @@ def identify(
     fit = Fit(Model(prior, motors, ()), kept, logs, moves_streams, progress, iterations, Checkpoint(checkpoint, mark))
     state, dropped, two = fit.run(wanted)
     model = fit.model.only(state.free)
-    linear, cover = fit.uncertainty(state)
+    cover, hessians, scores = fit.uncertainty(state)
     n = len(state.x)
     # Student's distribution, nearly, and the bias of a sum over so many of the lags that there are.
     quantile = 1.96 * (1.0 + 2.5 / max(len(kept) - n, 1) + 1.5 * fit.lags / len(kept))
@@ -119,7 +119,7 @@ def identify(
     parameters, ratios = report(model, state.x, cover[:n, :n], quantile, has_mass)
     resampled = {}
     if draws:
-        changes = bootstrap(linear, kept.log, len(logs), fit.lags, draws, seed)
+        changes = bootstrap(hessians, scores, fit.lags, draws, seed)
         tables = report(model, state.x, torch.cov(changes[:, :n].T).reshape(n, n), 1.96, has_mass)
         resampled = {name: (entry["low"], entry["high"]) for table in tables for name, entry in table.items()}
     found = parameters["command_delay"]["value"] if "command_delay" in parameters else motors.delay
@@ -252,7 +252,7 @@ class Fit:
             return state, dropped, "not asked for"
         start = State((*free, "asymmetry"), torch.cat((state.x, state.x.new_zeros(1))), state.streams, iteration=near)
         more = self._minimise(start, "two time constants")
-        _, cover = self.uncertainty(more)
+        cover, *_ = self.uncertainty(more)
         ratio, error = float(more.x[-1]), float(cover[len(free), len(free)].sqrt())
         value, low, high = (math.exp(ratio + end * error) for end in (0.0, -1.96, 1.96))
         said = f"rising / falling = {value:.2f}, 95 % between {low:.2f} and {high:.2f}"
@@ -260,10 +260,10 @@ class Fit:
             return more, dropped, f"two time constants: {said}"
         return state, dropped, f"one time constant: {said}"
 
-    def uncertainty(self, state: State) -> tuple[Linear, Tensor]:
-        """Residuals and derivatives at the optimum, and the covariance (n + L, n + L) of the unknowns."""
-        linear = self._problem(state).linearise(state, update_scale=True)
-        cover, bread, scores = covariance(linear, self.windows.log, len(self.logs), self.lags)
+    def uncertainty(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
+        """The covariance (n + L, n + L) of the unknowns at the optimum, and the equations behind it."""
+        hessians, scores = self._problem(state).equations(state, update_scale=True)
+        cover, bread = covariance(hessians, scores, self.windows.log, self.lags)
         if len(self.logs) > 2 and "thrust" in state.free:
             # The level of thrust differs from flight to flight, with rotors and battery, more than within one.
             sums = scores.new_zeros(len(self.logs), scores.shape[1]).index_add(0, self.windows.log, scores)
@@ -272,7 +272,7 @@ class Fit:
             i = state.free.index("thrust")
             wider[i] = (between[i] / cover[i, i].clamp_min(1e-300)).clamp_min(1.0).sqrt()
             cover = cover * wider[:, None] * wider
-        return linear, cover
+        return cover, hessians, scores
 
     def _problem(self, state: State) -> Problem:
         return Problem(self.model.only(state.free), self.windows, self.moves_streams, "thrust" in state.free)
@@ -289,7 +289,7 @@ class Fit:
         """The unknown that is least certain, if it is too uncertain, and why; or all that nothing depends on."""
         if not state.free:
             return {}
-        _, cover = self.uncertainty(state)
+        cover, *_ = self.uncertainty(state)
         variance = cover.diag()[: len(state.x)]
         untold = [name for name, x in zip(state.free, variance, strict=True) if x <= 0]
         if untold:

@@ -40,15 +40,6 @@ class State:
 
 
 @dataclasses.dataclass
-class Linear:
-    """Residuals and their derivative at one point, and the weights that both have in the cost."""
-
-    residual: Tensor  #: (W, m), whitened
-    jacobian: Tensor  #: (W, m, n + 1): the coordinates, then the window's stream delay
-    weight: Tensor  #: (W, m)
-
-
-@dataclasses.dataclass
 class Problem:
     """The windows of some flights and a model whose predictions are to fit them.
 
@@ -85,8 +76,9 @@ class Problem:
         robust = ROBUST**2 * ((1.0 + (raw / self.scale / ROBUST).square()).sqrt() - 1.0)
         return float(robust.sum()) / len(raw)
 
-    def linearise(self, state: State, update_scale: bool) -> Linear:
-        """Residuals and derivatives at a state."""
+    def linearise(self, state: State, update_scale: bool) -> tuple[Tensor, Tensor]:
+        """Whitened residuals (W, m) at a state, and their derivatives (W, m, n + 1) by the coordinates and the window's
+        stream delay."""
         n = len(state.x)
 
         def f(z: Tensor) -> tuple[Tensor, Tensor]:
@@ -101,7 +93,16 @@ class Problem:
         jacobian[..., n] *= UNKNOWNS["stream"].scale
         if not self.moves_streams:
             jacobian[..., n] = 0.0
-        return Linear(residual, jacobian, (1.0 + (residual / ROBUST).square()).rsqrt())
+        return residual, jacobian
+
+    def equations(self, state: State, update_scale: bool) -> tuple[Tensor, Tensor]:
+        """Hessian (W, n + L, n + L) and gradient (W, n + L) of each window's robust cost; of the stream delays only its
+        log's counts."""
+        residual, jacobian = self.linearise(state, update_scale)
+        stream = jacobian[..., -1:] * one_hot(self.windows.log, len(state.streams)).unsqueeze(1)
+        jacobian = torch.cat((jacobian[..., :-1], stream), -1)
+        weighted = jacobian * (1.0 + (residual / ROBUST).square()).rsqrt().unsqueeze(-1)
+        return weighted.transpose(1, 2) @ jacobian, (weighted * residual.unsqueeze(-1)).sum(1)
 
     def _spread(self, raw: Tensor) -> Tensor:
         """The standard deviation (m) of each residual, from medians; one for the three axes together."""
@@ -122,10 +123,9 @@ def minimise(problem: Problem, state: State, report: Callable[[State], None], ma
     if state.scale is not None:
         problem.scale = state.x.new_tensor(state.scale)
     while not state.converged and state.iteration < max_iterations:
-        linear = problem.linearise(state, update_scale=state.iteration < 8)
+        hessian, gradient = (x.sum(0) for x in problem.equations(state, update_scale=state.iteration < 8))
         state.scale = problem.scale.tolist()
         state.cost = problem.cost(state)
-        hessian, gradient = (x.sum(0) for x in per_window(linear, problem.windows.log, len(state.streams)))
         before = state
         for _ in range(8):
             state = _moved(before, _solve(hessian, gradient, before.damping), problem.model)
@@ -147,21 +147,12 @@ def minimise(problem: Problem, state: State, report: Callable[[State], None], ma
     return state
 
 
-def per_window(linear: Linear, log: Tensor, logs: int) -> tuple[Tensor, Tensor]:
-    """Hessian (W, n + L, n + L) and gradient (W, n + L) of each window; of the stream delays only its log's counts."""
-    coordinates, stream = linear.jacobian[..., :-1], linear.jacobian[..., -1:]
-    jacobian = torch.cat((coordinates, stream * one_hot(log, logs).unsqueeze(1)), -1)
-    weighted = jacobian * linear.weight.unsqueeze(-1)
-    return weighted.transpose(1, 2) @ jacobian, (weighted * linear.residual.unsqueeze(-1)).sum(1)
-
-
-def covariance(linear: Linear, log: Tensor, logs: int, lags: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The covariance (n + L, n + L) of the unknowns, with the inverse Hessian and the scores (W, n + L) behind it.
+def covariance(hessians: Tensor, scores: Tensor, log: Tensor, lags: int) -> tuple[Tensor, Tensor]:
+    """The covariance (n + L, n + L) of the unknowns, from the equations of windows, and the inverse Hessian in it.
 
     It is a sandwich: windows that follow each other err alike, since the air, the battery and the model's own faults
     stay, so the scores of windows up to ``lags`` apart are summed (Newey and West 1987).
     """
-    hessians, scores = per_window(linear, log, logs)
     hessian = hessians.sum(0)
     bread = _inverse(hessian)
     meat = scores.T @ scores
@@ -171,12 +162,11 @@ def covariance(linear: Linear, log: Tensor, logs: int, lags: int) -> tuple[Tenso
         meat += (1.0 - lag / (lags + 1.0)) * (part + part.T)
     used = int((hessian.diag() > 0).sum())
     correction = len(scores) / max(len(scores) - used, 1)
-    return correction * bread @ meat @ bread, bread, scores
+    return correction * bread @ meat @ bread, bread
 
 
-def bootstrap(linear: Linear, log: Tensor, logs: int, block: int, draws: int, seed: int) -> Tensor:
+def bootstrap(hessians: Tensor, scores: Tensor, block: int, draws: int, seed: int) -> Tensor:
     """Changes of the unknowns (draws, n + L) where blocks of windows are resampled, with one Gauss-Newton step each."""
-    hessians, scores = per_window(linear, log, logs)
     count = len(scores)
     generator = torch.Generator().manual_seed(seed)
     blocks = -(-count // block)

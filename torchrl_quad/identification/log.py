@@ -146,11 +146,10 @@ def read_log(
             moved = streams
             if mended.layout.time != layout.time:
                 moved = [replace(stream, time=stream.time * factor - late) for stream in streams]
-            given = {name: value for name, value in {**options, **mended.changes}.items() if name in options}
             if "span" in mended.changes:
                 low, high = mended.changes["span"]
                 moved = [stream.at((stream.time >= low) & (stream.time <= high)) for stream in moved]
-            return _read(path, moved, mended.layout, list(notes), **given)
+            return _read(path, moved, mended.layout, list(notes), {**options, **mended.changes})
 
         try:
             return read(start)
@@ -162,25 +161,18 @@ def read_log(
 
 
 def _read(
-    path: Path,
-    streams: Sequence[Stream],
-    layout: Layout,
-    notes: list[str],
-    onboard: Sequence[str] | None,
-    dt: float | None,
-    clearance: float,
-    max_gap: float,
-    min_duration: float,
+    path: Path, streams: Sequence[Stream], layout: Layout, notes: list[str], options: Mapping[str, Any]
 ) -> FlightLog:
-    """The flight in the streams of a file, as a layout says what they are."""
-    fields = layout.onboard if onboard is None else tuple(onboard)
+    """The flight in the streams of a file, as a layout says what they are, with the options of :func:`read_log`."""
+    clearance, max_gap, min_duration = (options[name] for name in ("clearance", "max_gap", "min_duration"))
+    fields = layout.onboard if options["onboard"] is None else tuple(options["onboard"])
     known = [*_FIELDS, "setpoint"]
     for field in fields:
         if field not in known:
             raise UserValueError(f"onboard: unknown field {shown(field)}. Choose from: {', '.join(known)}.")
     signals = _signals(layout, streams, path.name, notes)
     main = [signal for quantity, signal in signals.items() if not quantity.startswith(_OPTIONAL)]
-    grid, step = _grid(signals, main, dt, path.name)
+    grid, step = _grid(signals, main, options["dt"], path.name)
     valid = cover(main, grid, step, max_gap, notes)
     at = on_grid(signals, grid, step)
     on, _ = motors_on(at["motor_command"], step, path.name)

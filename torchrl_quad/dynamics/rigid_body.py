@@ -112,12 +112,6 @@ def drag(velocity_body: Vector, params: QuadrotorParams) -> Vector:
     return params.linear_drag.addcmul(params.quadratic_drag, velocity_body.abs()) * -velocity_body
 
 
-def drag_moment(air: Vector, params: QuadrotorParams) -> Vector:
-    """The torque (*, 3) [N m], body frame, of a drag (*, 3) [N] that acts ``drag_height`` above the centre of mass."""
-    x, y = air[..., :1] * params.drag_height, air[..., 1:2] * params.drag_height
-    return cat(-y, x, x * 0.0)
-
-
 def gyroscopic_torque(angular_velocity: Vector, inertia: Vector) -> Vector:
     """w x J w, (*, 3) [N m], body frame."""
     return cross(angular_velocity, inertia * angular_velocity)
@@ -136,7 +130,8 @@ def accelerations(
     push = along_z(wrench[..., :1]) if wrench.shape[-1] == 4 else cat(wrench[..., 4:], wrench[..., :1])
     height = params.drag_height.components[0] if isinstance(params.drag_height, Components) else None
     if not (isinstance(height, float) and height == 0.0):  # compiled code of such a drone has no moment
-        torque = torque + drag_moment(air, params)
+        x, y = air[..., :1] * params.drag_height, air[..., 1:2] * params.drag_height
+        torque = torque + cat(-y, x, x * 0.0)
     linear = quaternion.rotate(state.quaternion, (air + push) / params.mass)
     angular = (torque - gyroscopic_torque(state.angular_velocity, params.inertia)) / params.inertia
     return linear - along_z(params.gravity), angular

@@ -130,14 +130,11 @@ def _layout(bag: Any, topics: Mapping[str, str], columns: Asked, name: str) -> L
     named |= {second for first, second in RIVALS if first in named}
     rivals = {second: first for first, second in RIVALS}
     found, onboard = {}, BY_IMU
-    kinds = shipped("ros_messages.yaml")
-    for asked_for, kind in itertools.product((False, True), kinds):  # what a drone shall do is read last
-        topics_of_kind = sorted(
-            x for x in topics if topics[x] == kind and (x in of or bool(_ASKED_FOR.search(x.lower())) == asked_for)
-        )
-        quantities = kinds[kind]
+    kinds = shipped("ros_messages.yaml").items()
+    for asked_for, (kind, quantities) in itertools.product((False, True), kinds):  # what a drone shall do is read last
+        likely = [x for x in sorted(topics) if x in of or bool(_ASKED_FOR.search(x.lower())) == asked_for]
         for quantity, fields in quantities.items():
-            own, rival = topics_of_kind, rivals.get(quantity)
+            own, rival = [x for x in likely if topics[x] == kind], rivals.get(quantity)
             if of and quantity in pose:  # the caller means the pose of that topic only
                 own = [topic for topic in own if topic in of]
             if kind.endswith("/Actuators"):  # whose messages hold commands, or speeds

@@ -95,7 +95,7 @@ class QuadrotorParams:
         like = self.mass if isinstance(self.mass, Tensor) and self.mass.is_floating_point() else torch.empty(0)
         fields = self.fields()
         for name, value in fields.items():
-            object.__setattr__(self, name, _checked(name, value, like, "QuadrotorParams", fields["rotor_positions"]))
+            object.__setattr__(self, name, _checked(name, value, like, fields["rotor_positions"]))
         for broken in contradictions({name: getattr(self, name).detach().cpu().numpy() for name in JUDGED}):
             raise UserValueError(f"QuadrotorParams: {broken}.")
 
@@ -177,8 +177,7 @@ def read_drone(values: Mapping, dtype: torch.dtype = torch.float32, source: str 
         raise UserValueError(f"{source}: unknown field {shown(unknown)}. Allowed: {', '.join(FIELDS)}, motor_command.")
     like = torch.empty(0, dtype=torch.float64)
     given = {k: values[k] for k in FIELDS if values[k] is not None or k not in _OPTIONAL}
-    places = _tensor("rotor_positions", given["rotor_positions"], like, source)
-    fields = {name: _checked(name, x, like, source, places).to(torch.float64) for name, x in given.items()}
+    fields = {name: _tensor(name, x, like, source).to(torch.float64) for name, x in given.items()}
     command = None if motors is None else build(MotorCommand, f"{source}: motor_command", motors)
     try:
         return QuadrotorParams(**fields, motor_command=command).to(dtype=dtype)
@@ -217,8 +216,8 @@ def _tensor(name: str, value: Any, like: Tensor, source: str) -> Tensor:
         raise UserValueError(f"{source}: {what}.") from error
 
 
-def _checked(name: str, value: Any, like: Tensor, source: str, places: Any) -> Tensor:
-    value = _tensor(name, value, like, source)
+def _checked(name: str, value: Any, like: Tensor, places: Any) -> Tensor:
+    value = _tensor(name, value, like, "QuadrotorParams")
     value = value if value.dim() else value.reshape(1)
     shape, low, high, _ = FIELDS[name].values()
     rotors = places.shape[-2] if isinstance(places, Tensor) and places.dim() > 1 else 4
@@ -227,8 +226,8 @@ def _checked(name: str, value: Any, like: Tensor, source: str, places: Any) -> T
         one = " or ".join(map(str, shapes)) if name == "rotor_positions" else str(shapes[0])
         why = f" with the {rotors} rotors of rotor_positions" if "n" in shape and name != "rotor_positions" else ""
         raise UserValueError(
-            f"{source}: field {name!r} has shape {tuple(value.shape)}; it must be {one} for one drone{why}, "
-            f"or {('num_envs', *shapes[0])} for one per environment."
+            f"QuadrotorParams: field {name!r} has shape {tuple(value.shape)}; it must be {one} for one drone{why}, or "
+            f"{('num_envs', *shapes[0])} for one per environment."
         )
     numbers = value.detach().float()  # which finds a limit fit that was rounded to float32 on its way
     fits, rule = (numbers >= low) & (numbers <= high), f"between {low:g} and {high:g}"
@@ -238,5 +237,6 @@ def _checked(name: str, value: Any, like: Tensor, source: str, places: Any) -> T
         fits, rule = numbers.norm(dim=-1) > 1e-3, "a direction for each rotor, such as [0, 0, 1] for up"
     if not fits.all():
         rule += "; of a matrix give the diagonal" if name == "inertia" and value.shape[-2:] == (3, 3) else ""
-        raise UserValueError(f"{source}: field {name!r} must be {rule}, in SI units; got {shown(value.tolist())}.")
+        got = shown(value.tolist())
+        raise UserValueError(f"QuadrotorParams: field {name!r} must be {rule}, in SI units; got {got}.")
     return value

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import collections
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -27,7 +27,7 @@ class Mended:
     """How a log is read: with which layout, and how that and the options differ from what the caller gave."""
 
     layout: Layout
-    there: Collection[str]  #: the columns of the file
+    there: set[str]  #: the columns of the file
     columns: Mapping[str, Columns | None] = field(default_factory=dict)
     changes: Mapping[str, Any] = field(default_factory=dict)  #: of other arguments
     when: tuple[str, ...] = ()
@@ -48,18 +48,16 @@ class Mended:
             layout = replace(layout, convention=todo.get("convention", layout.convention))
             return replace(self, layout=layout, changes={**self.changes, **todo}, when=when)
         name = todo.get("name", quantity)
-        if quantity == "time":
-            columns = _changed(layout.time, [0], todo)
-            layout = replace(layout, time=columns)
-        else:
-            choices = layout.columns.get(quantity, ())
-            used = next((c for c in choices if all(column in self.there for column in c.names)), None)
-            if used is None:
-                return None
-            places = _places(layout.convention, quantity, len(used.names))
-            columns = None if "drop" in todo else _changed(used, places, todo)
-            kept = {q: x for q, x in layout.columns.items() if q not in (quantity, name)}
-            layout = replace(layout, columns=kept if columns is None else {**kept, name: (columns,)})
+        choices = (c for c in layout.columns.get(quantity, ()) if self.there >= set(c.names))
+        used = layout.time if quantity == "time" else next(choices, None)
+        if used is None:
+            return None
+        places = _places(layout.convention, quantity, len(used.names))
+        columns = None if "drop" in todo else _changed(used, places, todo)
+        kept = {q: x for q, x in layout.columns.items() if q not in (quantity, name)}
+        kept |= {} if columns is None else {name: (columns,)}
+        (time,) = kept.pop("time", (layout.time,))
+        layout = replace(layout, columns=kept, time=time)
         others = {q: x for q, x in self.columns.items() if q != quantity}
         return replace(self, layout=layout, columns={**others, name: columns}, when=when, done=(*self.done, kind))
 

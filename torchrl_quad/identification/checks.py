@@ -41,6 +41,7 @@ _EULER: list[Remedy] = [  # angles as in aviation, beside positions with z up
 ]
 _EULER += [{**_EULER[0], "offset": (0.0, 0.0, np.pi / 2.0), "when": f"{_EULER[0]['when']}, and yaw counts from north"}]
 _AXES = ("roll", "pitch", "yaw")
+_LENGTHS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}  # [m]
 
 
 def check_angles(signal: Signal) -> None:
@@ -96,16 +97,12 @@ def check_velocity(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: f
     if not 0.6 < factor < 1.6 or (fit > 0.99 and not 0.8 < factor < 1.25):
         size = "position" if factor < 1.0 else signal.field
         ratio = min(factor, 1.0 / factor)
-        lengths = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
-        lengths |= {"km/h": 1 / 3.6, "knots": 0.5144} if size == signal.field else {}
-        lengths = dict(sorted(lengths.items(), key=lambda item: abs(np.log(ratio / item[1]))))
+        units = _LENGTHS | ({"km/h": 1 / 3.6, "knots": 0.5144} if size == signal.field else {})
+        near = [item for item in units.items() if 0.8 < ratio / item[1] < 1.25]
+        near.sort(key=lambda item: abs(np.log(ratio / item[1])))
         raise WrongUnit(
             f"{signal} is {factor:.3g} times the derivative of {place}: they, or the clock, are in different units.",
-            *in_units(
-                size,
-                f"the {size.partition('_')[0]} is in",
-                **{k: x for k, x in lengths.items() if 0.8 < ratio / x < 1.25},
-            ),
+            *in_units(size, f"the {size.partition('_')[0]} is in", **dict(near)),
             *([] if 0.6 < factor < 1.6 else [_clock(factor)]),
             {"quantity": signal.field, "drop": True, "when": "the position is right"},
         )
@@ -168,12 +165,10 @@ def check_rates(
     """Compare the gyro with the derivative of the attitude under every convention, and note how late it is."""
     q, given, theirs = at["quaternion"], signals["quaternion"], replace(convention, xyzw=False)
     logged = theirs.to({"quaternion": q})["quaternion"]
-    hypotheses = {
-        name: theirs.back({"quaternion": logged[:, remedy.get("order", (0, 1, 2, 3))] * remedy.get("factor", 1.0)})[
-            "quaternion"
-        ]
-        for name, remedy in _QUATERNIONS.items()
-    }
+    hypotheses = {}
+    for name, remedy in _QUATERNIONS.items():
+        read = logged[:, remedy.get("order", (0, 1, 2, 3))] * remedy.get("factor", 1.0)
+        hypotheses[name] = theirs.back({"quaternion": read})["quaternion"]
     if "angular_velocity" not in signals:
         _check_by_thrust(at, given, hypotheses, dt, moving)
         return "no gyro: angular_velocity was derived from the attitude"
@@ -375,8 +370,7 @@ def check_lean(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float
     ratio = float(np.median(slopes[0][steep]) / max(np.median(slopes[1][steep]), 1e-12)) if steep.any() else 1.0
     sure = given.min() > (0.6 if moves else 0.85) and not 0.5 < ratio < 2.0
     if (moves or leans) and sure and not 0.4 < gain < 2.5:
-        lengths = {"centimetres": 1e-2, "millimetres": 1e-3, "feet": 0.3048}
-        near = {k: x for k, x in lengths.items() if 0.6 < gain * x < 1.7}
+        near = {k: x for k, x in _LENGTHS.items() if 0.6 < gain * x < 1.7}
         degrees = in_units("euler", "the angles are in", degrees=np.pi / 180.0) if gain < 0.1 else []
         raise WrongUnit(
             f"{said.format('less' if gain > 1.0 else 'more')}{gain:.3g} times as much acceleration as tilt.",

@@ -87,8 +87,7 @@ def identify(
         raise UserValueError("draws must be 0, for no bootstrap, or at least 2: one draw has no spread.")
     given = dict(known or {})
     delay = given.pop("command_delay", None)
-    prior = prediction.as_params(drone)
-    prior = prediction.as_params(prior.replace(**given)) if given else prior
+    prior = prediction.as_params(prediction.as_params(drone).replace(**given))
     _check_turning(prior, logs)
     prior, motors = _with_motors(prior, logs, delay)
     unknowns = unknowns_of(fields)
@@ -131,6 +130,7 @@ def identify(
     ends = zip(state.streams.tolist(), (state.streams - half).tolist(), (state.streams + half).tolist(), strict=True)
     clocks = [Estimate(value=value, low=low, high=high, unit="s") for value, low, high in ends]
     settings = {"past": past, "horizon": horizon, "seed": seed, "windows": len(kept), "held_out": int(held.sum())}
+    settings |= {"iterations": state.iteration, "cost": state.cost}
     return IdentificationResult(
         drone=fitted,
         prior=prior,
@@ -146,7 +146,7 @@ def identify(
         errors=errors,
         errors_by_flight=by_flight,
         trim=left,
-        settings=settings | {"iterations": state.iteration, "cost": state.cost},
+        settings=settings,
         logs=[log.name for log in logs],
         flights=logs,
     )

@@ -65,8 +65,8 @@ class Said:
     def __init__(self, data: Mapping[str, Any], source: str, given: Found) -> None:
         self.data, self.source, self.given, self.asked = data, source, given, set[str]()
 
-    def __call__(self, name: str, *shape: int | None) -> Any:
-        """An array of this shape, in which None is any length; or None, where the mapping has no such name."""
+    def __call__(self, name: str, *shape: int | str) -> Any:
+        """An array of this shape, in which "n" is any length; or None, where the mapping has no such name."""
         self.asked.add(name)
         if (value := self.data.get(name)) is None:
             return None
@@ -75,18 +75,16 @@ class Said:
             array = presets.as_array(value)
         except (ValueError, RecursionError) as error:
             raise UserValueError(f"{self.source}: {name!r}: {one_line(error)}.") from None
-        if shape[:1] == (None,) and array.shape == shape[1:]:  # one for all rotors
+        if shape[:1] == ("n",) and array.shape == shape[1:]:  # one for all rotors
             array = array[None]
-        if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
-            want = ", ".join("n" if n is None else str(n) for n in shape)
+        if not _fits(array, shape):
+            want = ", ".join(map(str, shape))
             raise UserValueError(f"{self.source}: {name!r} has shape {array.shape}; it must be ({want}).")
         return array
 
     def fields(self, **names: str) -> Found:
         """Fields that the mapping has under other names, as they are."""
-        shapes = {x: () if FIELDS[x]["shape"] == (1,) else FIELDS[x]["shape"] for x in names}
-        said = {x: (self(name, *(None if n == "n" else n for n in shapes[x])), "") for x, name in names.items()}
-        return said | self.given
+        return {field: (self(name, *_shape(field)), "") for field, name in names.items()} | self.given
 
 
 def usable(given: Mapping[str, Any]) -> Found:
@@ -94,19 +92,24 @@ def usable(given: Mapping[str, Any]) -> Found:
     found: Found = {}
     for name, value in given.items():
         with contextlib.suppress(ValueError, TypeError, RecursionError, KeyError):
-            array, shape = presets.as_array(value), FIELDS[name]["shape"]
-            want = () if shape == (1,) else shape
-            if (
-                array.size
-                and len(want) == array.ndim
-                and all(n in ("n", m) for n, m in zip(want, array.shape, strict=True))
-            ):
+            array = presets.as_array(value)
+            if array.size and _fits(array, _shape(name)):
                 found[name] = array, GIVEN
     return found
 
 
-def placed(positions: Array, directions: Array | None = None, note: str = "") -> Found:
+def _shape(field: str) -> tuple[int | str, ...]:
+    return () if FIELDS[field]["shape"] == (1,) else FIELDS[field]["shape"]
+
+
+def _fits(array: Array, shape: Sequence[int | str]) -> bool:
+    return len(shape) == array.ndim and all(n in ("n", m) for n, m in zip(shape, array.shape, strict=True))
+
+
+def placed(positions: Array | None, directions: Array | None = None, note: str = "") -> Found:
     """Where rotors (n, 3) are, and where they point if they are tilted; of upright ones the height does not count."""
+    if positions is None:
+        return {}
     if directions is None or np.allclose(directions, [0.0, 0.0, 1.0], atol=1e-6):
         return {"rotor_positions": (positions[:, :2], note)}
     return {"rotor_positions": (positions, note), "rotor_direction": (directions, "")}
@@ -118,13 +121,8 @@ def diagonal(matrix: Any, note: str = "") -> Found:
         return {}
     products = abs(matrix - np.diag(np.diag(matrix))).max()
     if products > 0.05 * np.diag(matrix).min():
-        return {
-            "inertia": (
-                None,
-                f"its products of inertia are not small, {products:.2g} kg m2, beside {listed(np.diag(matrix))}; give "
-                "it about principal axes",
-            )
-        }
+        why = f"its products of inertia are not small, {products:.2g} kg m2, beside {listed(np.diag(matrix))}"
+        return {"inertia": (None, f"{why}; give it about principal axes")}
     left = f"products of inertia up to {products:.2g} kg m2 left out" if products > 1e-6 * matrix.max() else ""
     return {"inertia": (np.diag(matrix), "; ".join(x for x in (note, left) if x))}
 
@@ -136,7 +134,8 @@ def symmetric(xx: Any, yy: Any, zz: Any, xy: Any, xz: Any, yz: Any) -> Array:
 
 def same(values: Any, what: str) -> tuple[Any, str]:
     """The value that all rotors have; none, with the reason, if they differ."""
-    values = np.asarray(values, float)
+    if values is None:
+        return None, ""
     same = np.allclose(values, values[:1], rtol=1e-6, atol=0.0)
     return (values[0], "") if same else (None, f"rotors differ in {what}, and must not")
 
@@ -189,9 +188,8 @@ def _flightmare(said: Said) -> Found:
         found |= placed(np.stack(places), note="front right, back left, back right, front left")
         found["rotor_spin"] = [-1, -1, 1, 1], "of Agilicious's allocation, not in the file"
     elif arm is not None:
-        found |= placed(
-            arm * math.sqrt(0.5) * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]), note="the arm at 45 degrees"
-        )
+        corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
+        found |= placed(arm * math.sqrt(0.5) * corners, note="the arm at 45 degrees")
         found["rotor_spin"] = [1, -1, 1, -1], "of Flightmare's allocation, not in the file"
         if found["inertia"][0] is None and mass is not None:
             found["inertia"] = mass / 12.0 * arm**2 * np.array([4.5, 4.5, 7.0]), "of mass and arm, as in Flightmare"
@@ -199,23 +197,22 @@ def _flightmare(said: Said) -> Found:
 
 
 def _l2f(said: Said) -> Found:
-    gravity, curves = said("gravity", 3), said("rotor_thrust_coefficients", None, 3)
+    gravity, curves = said("gravity", 3), said("rotor_thrust_coefficients", "n", 3)
     turn = np.array([1.0, -1.0, -1.0]) if gravity is not None and gravity[2] > 0.0 else np.ones(3)  # z points down
     names = ("rotor_positions", "rotor_thrust_directions", "rotor_torque_directions")
-    places, up, torque = (None if (x := said(name, None, 3)) is None else x * turn for name in names)
-    limit, kappa = said("action_limit", None), said("rotor_torque_constants", None)
-    times = [said(f"rotor_time_constants_{name}", None) for name in ("rising", "falling")]
+    places, up, torque = (None if (x := said(name, "n", 3)) is None else x * turn for name in names)
+    limit, kappa = said("action_limit", "n"), said("rotor_torque_constants", "n")
+    times = [said(f"rotor_time_constants_{name}", "n") for name in ("rising", "falling")]
     said.asked |= {"hovering_throttle_relative"}
     inertia, inverse = said("J", 3, 3), said("J_inv", 3, 3)
-    found = said.fields(mass="mass") | diagonal(inertia) | ({} if places is None else placed(places, up))
+    found = said.fields(mass="mass") | diagonal(inertia) | placed(places, up)
     if inertia is not None and inverse is not None and not np.allclose(inertia @ inverse, np.eye(3), atol=0.05):
         found["inertia"] = None, "J_inv is not the inverse of J"
     if up is not None and torque is not None:
         found["rotor_spin"] = np.sign((up * torque).sum(-1)), ""
     if gravity is not None:
         found["gravity"] = np.linalg.norm(gravity), ""
-    if kappa is not None:
-        found["yaw_torque_coefficient"] = same(kappa, "rotor_torque_constants")
+    found["yaw_torque_coefficient"] = same(kappa, "rotor_torque_constants")
     if times[0] is not None and times[1] is not None:
         found["motor_time_constant"] = same(np.stack(times, -1), "their time constants")
     if curves is not None and limit is not None and limit.size == 2:
@@ -230,7 +227,7 @@ def _drone_models(said: Said) -> Found:
     lag = "rotor_tau" if "rotor_tau" in said.data else "thrust_tau"
     found = said.fields(mass="mass", yaw_torque_coefficient="thrust2torque", motor_time_constant=lag)
     found |= diagonal(said("J", 3, 3))
-    arm, mix, gravity = said("L"), said("mixing_matrix", 3, None), said("gravity_vec", 3)
+    arm, mix, gravity = said("L"), said("mixing_matrix", 3, "n"), said("gravity_vec", 3)
     force, torque = said("rpm2thrust", 3), said("rpm2torque", 3)
     curve = None if force is None else force[::-1] / [RPM**2, RPM, 1.0]
     found["thrust_map"] = curve, ""
@@ -262,9 +259,9 @@ def _rotorpy(said: Said) -> Found:
     names = {x: x for x in ("mass", "rotor_speed_min", "rotor_speed_max")}
     found = said.fields(motor_time_constant="tau_m", rotor_spin="rotor_directions", **names)
     moments, drag = [said(f"I{axes}") for axes in AXES], [said(f"c_D{axis}") for axis in "xyz"]
-    k2, torque, places = said("k_eta"), said("k_m"), said("rotor_pos", None, 3)
+    k2, torque, places = said("k_eta"), said("k_m"), said("rotor_pos", "n", 3)
     said.asked.add("num_rotors")
-    found |= {} if places is None else placed(places)
+    found |= placed(places)
     if all(x is not None for x in moments[:3]):
         found |= diagonal(symmetric(*(x or 0.0 for x in moments)))
     if all(x is not None for x in drag):
@@ -289,7 +286,7 @@ def _by_angles(said: Said) -> Found:
         each = [rotors[k] for k in sorted(rotors, key=lambda k: str(k).zfill(3))]
         rotors = {theirs: [x[ours] for x in each] for ours, theirs in names.items() if all(ours in x for x in each)}
     part = Said(rotors if isinstance(rotors, Mapping) else {}, f"{said.source}: rotor_configuration", {})
-    n = next((len(x) for x in part.data.values() if isinstance(x, list)), None)
+    n = next((len(x) for x in part.data.values() if isinstance(x, list)), "n")
     angle, arm, turn, force, torque = (part(name, n) for name in names.values())
     found, fastest = said.fields(mass="mass"), part("max_rotation_velocities", n)
     if isinstance(inertia, Mapping) and None not in map(inertia.get, AXES[:3]):
@@ -299,8 +296,7 @@ def _by_angles(said: Said) -> Found:
         found |= placed((arm * [np.cos(angle), np.sin(angle), 0.0 * angle]).T.round(9), note="arms at their angles")
     if turn is not None:
         found["rotor_spin"] = -turn, "against direction, which is 1 counter-clockwise"
-    if fastest is not None:
-        found["rotor_speed_max"] = same(fastest, "max_rotation_velocities")
+    found["rotor_speed_max"] = same(fastest, "max_rotation_velocities")
     if force is not None and force.all():
         k2, why = same(force, "their force constants")
         found["thrust_map"] = (None if k2 is None else [k2, 0.0, 0.0]), why

@@ -62,16 +62,16 @@ def read_xml(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
         (x for x in plugins if x.find("motorConstant") is not None), key=lambda x: _digits(x.findtext("motorNumber"))
     )
     short = {_last(name): name for name in links}
-    said = [(x.findtext("linkName") or "").strip() for x in motors]
-    rotors = [x if x in links else short.get(_last(x), "") for x in said]
+    motor_links = [(x.findtext("linkName") or "").strip() for x in motors]
+    rotors = [x if x in links else short.get(_last(x), "") for x in motor_links]
     plain = {x: re.sub("(quad|hexa|octo|multi)_?rotor", "", x.lower()) for x in links}
-    bodies = {x: said for x, said in plain.items() if not _is_bare(links[x])}  # others may be pictures of rotors
-    names = itertools.product((bodies, plain), _OTHER, (_NUMBERED, _PLACED), ("rotor", "prop", "motor"))
-    for known, other, name, word in names:
-        named = [x for x, said in known.items() if re.search(name.format(word), said) and not re.search(other, said)]
+    bodies = {x: name for x, name in plain.items() if not _is_bare(links[x])}  # others may be pictures of rotors
+    ways = itertools.product((bodies, plain), _OTHER, (_NUMBERED, _PLACED), ("rotor", "prop", "motor"))
+    for known, other, like, word in ways:
+        named = [x for x, name in known.items() if re.search(like.format(word), name) and not re.search(other, name)]
         rotors = rotors or sorted(named, key=_digits)
     if "" in rotors:
-        which = shown(said[rotors.index("")])
+        which = shown(motor_links[rotors.index("")])
         raise UserValueError(f"{path}: the linkName of a motor, {which}, is that of no link. Name its link.")
     if includes and not rotors:  # the world's own model is the ground
         raise world
@@ -87,11 +87,11 @@ def read_xml(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
     _add_motors(found, motors, str(path), given)
     dropped = ("velocity_decay/linear", "velocity_decay/angular", "rollingMomentCoefficient")
     unread = [x for x in dropped if any((y.text or "").strip("0. \n\t") for y in root.iterfind(f".//{x}"))]
-    if (said := root.find("properties")) is not None and root.tag == "robot":
-        values = {name: presets.parse(text.encode(), name) for name, text in said.attrib.items()}
-        numbers = Said(values, str(path), given)
-        _add_attributes(found, numbers, root.get("name", ""))
-        return str(path), "URDF of gym-pybullet-drones", found, [x for x in said.attrib if x not in numbers.asked]
+    if (properties := root.find("properties")) is not None and root.tag == "robot":
+        values = {name: presets.parse(text.encode(), name) for name, text in properties.attrib.items()}
+        said = Said(values, str(path), given)
+        _add_attributes(found, said, root.get("name", ""))
+        return str(path), "URDF of gym-pybullet-drones", found, [x for x in values if x not in said.asked]
     return str(path), "URDF" if root.tag == "robot" else "SDF", found, unread
 
 
@@ -119,9 +119,8 @@ def _held_joints(drone: ET.Element, rotors: Sequence[str], path: Path) -> list[s
         spins = False
         for link in [x for x in chain if x not in shared and x in joints and _moves(joints[x][1])]:
             joint = joints[link][1]
-            axis = _numbers(
-                next((x.get("xyz") or x.findtext("xyz") for x in joint.iter("axis")), "0 0 1"), 3, str(path)
-            )
+            said = next((x.get("xyz") or x.findtext("xyz") for x in joint.iter("axis")), "0 0 1")
+            axis = _numbers(said, 3, str(path))
             if spins or (link != chain[0] and abs(axis[2]) < 0.7 * np.linalg.norm(axis)):
                 why = f"the joint {shown(joint.get('name'))} turns the rotor {shown(chain[0])}"
                 raise UserValueError(f"{path}: {why}, and rotors here are fixed to the body. Take another drone.")
@@ -331,7 +330,8 @@ def _add_motors(found: Found, motors: Sequence[ET.Element], source: str, given: 
     def said(*names: str) -> tuple[Any, str]:
         if any(x.find(name) is None for x in motors for name in names):
             return None, ""
-        value, why = same([[_numbers(x.findtext(name), 1, source)[0] for name in names] for x in motors], names[0])
+        each = np.array([[_numbers(x.findtext(name), 1, source)[0] for name in names] for x in motors])
+        value, why = same(each, names[0])
         return (value if value is None or len(set(value)) > 1 else value[0]), why
 
     if not motors:

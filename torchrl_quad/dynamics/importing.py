@@ -152,17 +152,13 @@ def _completed(
         rotors = FlightController(drone)
     except UserValueError as error:
         raise UserValueError(str(error).replace("drone:", f"{source}:", 1)) from None
-    most = rotors.reach().clamp(1.1, 5.0)
+    most = (10.0 * rotors.reach().clamp(1.1, 5.0)).floor().item() / 10.0
     rates = rotors.spare_torque() / drone.inertia * torch.tensor([0.1, 0.1, 0.5])
-    rates = rates.minimum(torch.tensor([6.0, 6.0, 2.0])).clamp_min(0.1)
-    limits = {
-        "max_body_rate": (
-            (10.0 * rates).floor() / 10.0,
-            "chosen here: at most what hovering rotors reach in 0.1, 0.1, 0.5 s",
-        ),
-        "max_thrust_to_weight": ((10.0 * most).floor().item() / 10.0, "chosen here: at most what the rotors reach"),
-    }
-    found = limits | found
+    rates = (10.0 * rates.minimum(torch.tensor([6.0, 6.0, 2.0])).clamp_min(0.1)).floor() / 10.0
+    found = {
+        "max_body_rate": (rates, "chosen here: at most what hovering rotors reach in 0.1, 0.1, 0.5 s"),
+        "max_thrust_to_weight": (most, "chosen here: at most what the rotors reach"),
+    } | found
     gains = suggest_gains({k: v for k, (v, _) in found.items()})
     return {k: (v.numpy(), "chosen here: suggest_gains, for steps of 5 ms") for k, v in gains.items()} | found
 
@@ -174,9 +170,8 @@ def _examples(found: Found) -> dict[str, str]:
     if places is not None:
         around = np.arctan2(*np.asarray(places, float).T[1::-1]).argsort().argsort()
         n, spin = len(around), str([1 - 2 * int(k % 2) for k in around])
-    heavy, fast = (
-        float(np.max(x)) if isinstance(x, float | int | np.ndarray) else y for x, y in ((mass, 0.5), (speed, 1500.0))
-    )
+    usual = ((mass, 0.5), (speed, 1500.0))
+    heavy, fast = (float(np.max(x)) if isinstance(x, float | int | np.ndarray) else y for x, y in usual)
     force, curve = 3.0 * 9.81 * heavy / n, found.get("thrust_map", (None,))[0]
     most = ASKED["rotor_speed_max"] if curve is None else f"{speed_at(force, curve):.4g}"
     thrust = f"[{force / max(fast, 1.0) ** 2:.2g}, 0, 0]"
@@ -195,22 +190,22 @@ def _read(drone: Any, entry: str | None, fields: Mapping[str, Any]) -> tuple[str
     """Of a drone: its source, the kind of file if it is no drone of ours, what it says, and what of it was not read."""
     suffix = Path(drone).suffix.lower() if isinstance(drone, str | Path) else ""
     if suffix in CONVERT:
-        raise UserValueError(
-            f"{drone}: a {suffix} file has to be run before its numbers can be read. {CONVERT[suffix]}"
-        )
+        why = f"a {suffix} file has to be run before its numbers can be read"
+        raise UserValueError(f"{drone}: {why}. {CONVERT[suffix]}")
     if suffix in (".urdf", ".sdf", ".world", ".xml", ".jinja"):
         if entry is not None:
             raise UserValueError(f"{drone} holds one drone. Leave out entry={shown(entry)}.")
         return read_xml(Path(drone), usable(fields))
     if suffix == ".json":
         source, data = str(drone), read_json(Path(drone))
+        data = data if isinstance(data, Mapping) else {}
     elif suffix not in ("", ".yaml", ".yml", ".toml") and os.path.isfile(drone):
         raise UserValueError(f"{drone}: no drone can be read from a {suffix} file. {READABLE}")
     else:
         source, data = read_fields(drone)
     drones = {
         str(name): (kind, reader, part)
-        for name, part in ({"": data, **data} if isinstance(data, Mapping) else {}).items()
+        for name, part in {"": data, **data}.items()
         for kind, (reader, *keys) in MAPPINGS.items()
         if isinstance(part, Mapping) and any(key in part for key in keys)
     }
@@ -219,10 +214,9 @@ def _read(drone: Any, entry: str | None, fields: Mapping[str, Any]) -> tuple[str
     if (entry is None and len(drones) > 1) or (entry is not None and entry not in drones):
         names = f"entry={next(iter(drones))!r} or another of {shown(list(drones))}"
         raise UserValueError(f"{source}: choose one drone of the file, by {names}; got {shown(entry)}.")
-    own = set(FIELDS) & set(data) if isinstance(data, Mapping) else set()
+    own = set(FIELDS) & set(data)
     own = own if own - {"mass", "inertia", "gravity"} or (own and own == set(data)) else set()  # others, too, say these
-    parts = [data, *data.values()] if isinstance(data, Mapping) else []
-    if any(isinstance(part, Mapping) and "rpy_coef" in part for part in parts):
+    if any(isinstance(part, Mapping) and "rpy_coef" in part for part in (data, *data.values())):
         raise UserValueError(
             f"{source}: a model fitted to attitude commands (so_rpy of drone-models) has no rotors. Give the "
             "params.toml that has them, with mass and rpm2thrust."

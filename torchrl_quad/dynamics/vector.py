@@ -31,8 +31,8 @@ if TYPE_CHECKING:  # to a type checker both forms are tensors
 else:
 
     def _of_each(function):
-        def method(self):
-            return Components([function(x) for x in self.components])
+        def method(self, *limit):
+            return Components([function(x, *limit) for x in self.components])
 
         return method
 
@@ -63,6 +63,7 @@ else:
         __mul__, __truediv__ = _of_both(operator.mul), _of_both(operator.truediv)
         __neg__, abs, sign = map(_of_each, (operator.neg, operator.abs, torch.sign))
         sqrt, rsqrt = map(_of_each, (torch.sqrt, torch.rsqrt))
+        clamp_min, clamp_max = map(_of_each, (torch.clamp_min, torch.clamp_max))
 
         def __rtruediv__(self, other):
             return Components([other / x for x in self.components])
@@ -72,12 +73,6 @@ else:
 
         def exp(self):
             return Components([x.exp() if isinstance(x, Tensor) else math.exp(x) for x in self.components])
-
-        def clamp_min(self, low):
-            return Components([x.clamp_min(low) for x in self.components])
-
-        def clamp_max(self, high):
-            return Components([x.clamp_max(high) for x in self.components])
 
         def maximum(self, other):
             return _each(lambda x, y: torch.maximum(x, y) if isinstance(y, Tensor) else x.clamp_min(y), self, other)

@@ -127,7 +127,6 @@ def _layout(bag: Any, topics: Mapping[str, str], columns: Asked, name: str) -> L
     of = {topic for topic in topics if any(place.startswith(f"{topic}.") for place in places)}
     if places and not of:
         named |= pose
-    named |= {second for first, second in RIVALS if first in named}
     rivals = {second: first for first, second in RIVALS}
     found, onboard = {}, BY_IMU
     kinds = shipped("ros_messages.yaml").items()

@@ -112,9 +112,8 @@ class Problem:
         pushed = torch.full_like(push, torch.inf)
         if self.counts_push:
             pushed[2] = push[2].clamp_min(_PUSH_FLOOR)
-        return torch.cat(
-            (each.expand(-1, -1, 3).flatten(), pushed, turned.mean().clamp_min(_FLOOR[2]).expand(POINTS * 3))
-        )
+        turned = turned.mean().clamp_min(_FLOOR[2]).expand(POINTS * 3)
+        return torch.cat((each.expand(-1, -1, 3).flatten(), pushed, turned))
 
 
 def minimise(problem: Problem, state: State, report: Callable[[State], None], max_iterations: int) -> State:
@@ -134,10 +133,8 @@ def minimise(problem: Problem, state: State, report: Callable[[State], None], ma
                 change = float((state.x - before.x).abs().max()) if len(before.x) else 0.0
                 change = max(change, float((state.streams - before.streams).abs().max()) / UNKNOWNS["stream"].scale)
                 is_still = change < CONVERGED or before.cost - cost < CONVERGED * 0.1 * before.cost
-                damping = max(before.damping / 6.0, 1e-9)
-                state = dataclasses.replace(
-                    state, cost=cost, damping=damping, converged=before.iteration >= 8 and is_still
-                )
+                state.cost, state.damping = cost, max(before.damping / 6.0, 1e-9)
+                state.converged = before.iteration >= 8 and is_still
                 break
             before.damping *= 8.0
         else:  # no step makes it better

@@ -233,9 +233,9 @@ def _columns_there(names: Iterable[str], asked: Sequence[str] = ()) -> str:
     )
 
 
-def listed(names: Iterable[str], asked: Sequence[str], most: int = 2200) -> str:
-    """What there is, whole where ``most`` letters hold it, else what is most like something asked for."""
-    there = sorted(names)
+def listed(names: Iterable[str], asked: Sequence[str]) -> str:
+    """What there is, whole where 2200 letters hold it, else what is most like something asked for."""
+    there, most = sorted(names), 2200
     if sum(map(len, there)) + 2 * len(there) <= most:
         return f": {', '.join(there) or 'none'}"
     words = [set(_words(x)) for x in asked]

@@ -180,9 +180,9 @@ def runs(mask: Mask, shortest: float = 0.0, dt: float = 1.0) -> NDArray[np.int_]
     return edges[(edges[:, 1] - edges[:, 0]) * dt >= shortest - 1e-9]
 
 
-def slope(x: Array, dt: float, span: float = 0.04) -> Array:
-    """The rate of change (T, n): at each sample the slope of the line through its neighbours within ``span`` [s]."""
-    half = min(max(1, round(span / dt)), (len(x) - 1) // 2)
+def slope(x: Array, dt: float) -> Array:
+    """The rate of change (T, n): at each sample the slope of the line through its neighbours within 0.04 s."""
+    half = min(max(1, round(0.04 / dt)), (len(x) - 1) // 2)
     k = np.arange(-half, half + 1)
     padded = np.concatenate((2.0 * x[0] - x[half:0:-1], x, 2.0 * x[-1] - x[-2 : -half - 2 : -1]))
     return convolved(padded, -k / (k @ k * dt))

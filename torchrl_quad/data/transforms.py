@@ -112,7 +112,8 @@ class Flown(NamedTuple):
         found = {key: leaf(entries, key) for key in map(unravel_key, base.state_keys)}
         wanted = {*spec, *self.memory}
         values = [(key, value) for key, value in self.known.items() if value is not None and key in given]
-        values.sort(key=lambda pair: pair[1].kind != "entry")  # what is there as it was comes first
+        # What is there as it was comes first, and what is clipped last.
+        values.sort(key=lambda pair: (pair[1].kind != "entry", pair[1].holds("clip")))
         for key, value in values:
             if not wanted.isdisjoint(value.sources()):
                 value.undo(given[key], found, spec)

@@ -109,6 +109,17 @@ class Value(NamedTuple):
         """The entries of the environment that it reads."""
         return [self.about] if self.kind == "entry" else [key for part in self.parts for key in part.sources()]
 
+    def holds(self, kind: str) -> bool:
+        """Whether a value of this kind is in it."""
+        return self.kind == kind or any(part.holds(kind) for part in self.parts)
+
+    def clips_alike(self) -> bool:
+        """Whether clipped frames are those of before, clipped: none lie in others, or are scaled by their places."""
+        if self.kind == "frames":
+            return not self.parts[0].holds("frames")
+        by_place = any(isinstance(x, Tensor) and x.numel() > 1 for x in self.constants) and self.holds("frames")
+        return not by_place and all(part.clips_alike() for part in self.parts)
+
     def tensors(self) -> list[Tensor]:
         """All constants, in the order in which :meth:`compute` takes them."""
         own = [x for x in self.constants if isinstance(x, Tensor)]
@@ -236,7 +247,10 @@ def elementwise(transform: Any, x: Value) -> Value:
     if isinstance(transform, RewardClipping):
         return Value("clip", None, (x,), (transform.clamp_min, transform.clamp_max))
     if isinstance(transform, ClipTransform):
-        return Value("clip", None, (x,), (transform.low, transform.high))
+        clipped = Value("clip", None, (x,), (transform.low, transform.high))
+        if not clipped.clips_alike():
+            raise NotImplementedError("it clips frames of frames, or frames that are scaled by their places")
+        return clipped
     return Value("cast", transform.dtype_out, (x,))
 
 

@@ -16,7 +16,7 @@ UNWRAP = "data.unwrap"  # the one helper that networks and pictures share with d
 TORCHRL = {"torch", "torchrl", "tensordict"}
 # What each part of the package may import: of the others, parts or single modules, and which libraries.
 ALLOWED = {
-    "dynamics": ({"airframe"}, {"torch", "numpy", "yaml"}),
+    "dynamics": ({"airframe"}, {"torch", "numpy", "yaml", "mujoco"}),
     "engine": (set(), {"torch", "tensordict"}),
     "vision": ({"dynamics", "engine"}, {"torch"}),
     "envs": ({"dynamics", "engine", "rotations", "vision"}, {*TORCHRL, "gymnasium", "numpy", "pydantic"}),

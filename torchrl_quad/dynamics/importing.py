@@ -26,7 +26,8 @@ from torchrl_quad.dynamics.import_formats import (
     speed_at,
     usable,
 )
-from torchrl_quad.dynamics.import_models import read_xml
+from torchrl_quad.dynamics.import_mjcf import read_mjcf
+from torchrl_quad.dynamics.import_models import read_model, read_tree
 from torchrl_quad.dynamics.parameters import FIELDS, QuadrotorParams, read_drone, read_fields
 from torchrl_quad.errors import UserValueError, one_line, shown
 
@@ -195,7 +196,9 @@ def _read(drone: Any, entry: str | None, fields: Mapping[str, Any]) -> tuple[str
     if suffix in (".urdf", ".sdf", ".world", ".xml", ".jinja"):
         if entry is not None:
             raise UserValueError(f"{drone} holds one drone. Leave out entry={shown(entry)}.")
-        return read_xml(Path(drone), usable(fields))
+        root = read_tree(Path(drone))
+        reader = read_mjcf if root.tag == "mujoco" else read_model
+        return reader(root, Path(drone), usable(fields))
     if suffix == ".json":
         source, data = str(drone), read_json(Path(drone))
         data = data if isinstance(data, Mapping) else {}

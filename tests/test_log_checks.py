@@ -1,6 +1,7 @@
 """What follows from other quantities of a log is compared with them: faults of a known flight, and what mends them."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from refusals import refuses
 from scipy.spatial.transform import Rotation
 
 from torchrl_quad.identification import Columns, LogError, read_log
+from torchrl_quad.identification.layouts import choose
 
 T = np.arange(0.0, END, 0.01)
 TRUE = flight(T)
@@ -74,3 +76,12 @@ def test_rows_that_a_tracker_lost_count_as_missing(tmp_path):
         changed["quaternion"] = np.where(lost[:, None], attitude, TRUE["quaternion"])
         log = read_log(write_csv(tmp_path / "a.csv", own_table(T, **changed)), TABLE)
         np.testing.assert_allclose(log.position, TRUE["position"][: len(log.time)], atol=2e-3)
+
+
+def test_a_remedy_names_the_columns_that_were_read_and_not_those_that_are_zero(tmp_path):
+    layout = choose(TABLE, None)
+    batteries = {"battery_voltage": (Columns(("first",)), Columns(("second",)))}
+    table = own_table(T) | {"first": 0.0 * T, "second": 16000.0 - 10.0 * T}
+    path = write_csv(tmp_path / "a.csv", table)
+    said = "second.* is 1.5[0-9]+e.04 in the median.*If it is in millivolts, write columns=.*\\('second',\\), scale=0.001"
+    refuses(said, read_log, path, replace(layout, columns={**layout.columns, **batteries}), error=LogError)

@@ -160,22 +160,34 @@ def choose(columns: Asked, default: Layout | None) -> Layout:
     return replace(default, columns=kept | chosen, time=time[0] if time else default.time, required=frozenset(chosen))
 
 
+def settled(layout: Layout, streams: Sequence[Stream]) -> Layout:
+    """The layout with one choice for each quantity that the streams have: the first that is not zero all along.
+
+    Autopilots write zeros where nothing is measured, as of a first battery that is not there.
+    """
+    columns = {column: values for stream in reversed(streams) for column, values in stream.columns.items()}
+    kept = dict(layout.columns)
+    for quantity, choices in kept.items():
+        there = [c for c in choices if columns.keys() >= set(c.names)]
+        measured = [c for c in there if any(np.any(columns[column]) for column in c.names)]
+        kept[quantity] = tuple((measured or there)[:1]) or choices
+    return replace(layout, columns=kept)
+
+
 def gather(layout: Layout, streams: Sequence[Stream], name: str) -> dict[str, Signal]:
-    """Each quantity of the layout that the streams have, in our units, frames and orders; NaN beyond ``LARGEST``."""
+    """Each quantity of a settled layout that the streams have, in our units, frames and orders; NaN beyond
+    ``LARGEST``."""
     owner = {column: stream for stream in reversed(streams) for column in stream.columns}
     found = {}
     for quantity, choices in layout.columns.items():
-        there = [c for c in choices if all(column in owner for column in c.names)]
-        if not there:
+        choice = next((c for c in choices if owner.keys() >= set(c.names)), None)
+        if choice is None:
             if quantity in layout.required:
                 missing = sorted({column for c in choices for column in c.names} - owner.keys())
                 raise MissingColumns(
                     f"{name} has no column {', '.join(missing)}, named for {quantity}. {_columns_there(owner, missing)}"
                 )
             continue
-        # Autopilots write zeros where nothing is measured, as of a first battery that is not there.
-        measured = (c for c in there if any(np.any(owner[column].columns[column]) for column in c.names))
-        choice = next(measured, there[0])
         stream = owner[choice.names[0]]
         if any(owner[column] is not stream for column in choice.names):
             raise UnreadableLog(

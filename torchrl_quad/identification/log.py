@@ -24,7 +24,7 @@ from torchrl_quad.identification.errors import (
     WrongUnit,
     in_units,
 )
-from torchrl_quad.identification.layouts import QUANTITIES, Columns, Layout, gather
+from torchrl_quad.identification.layouts import QUANTITIES, Columns, Layout, gather, settled
 from torchrl_quad.identification.pieces import broken, find_pieces, motors_on
 from torchrl_quad.identification.remedies import Mended, remedy_for
 from torchrl_quad.identification.signals import LARGEST, Array, Signal, Stream, clean, cover, on_grid
@@ -138,6 +138,7 @@ def read_log(
     with _naming(path):
         streams, layout, notes = read_streams(path, columns)
         layout = layout if convention is None else replace(layout, convention=convention)
+        layout = settled(layout, streams)
         start = Mended(layout, {column for stream in streams for column in stream.columns})
 
         def read(mended: Mended) -> FlightLog:

@@ -173,7 +173,8 @@ def measure(n: int, mode: str, task: str, horizon: int, rounds: int, device: str
     for name in cases:
         both = {key: round(n * horizon / best[name, i] / 1e3, 1) for i, key in enumerate(("forward", "with gradient"))}
         ratio = best["physics", 1] / best[name, 1]
-        rows.append({"num_envs": n, "mode": mode, "case": name, **both, "of physics": round(ratio, 2)})
+        flown = {"task": "racing" if name == "step" else task}
+        rows.append({"num_envs": n, "mode": mode, "case": name, **both, "of physics": round(ratio, 2), **flown})
     return rows
 
 

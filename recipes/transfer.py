@@ -9,7 +9,7 @@ Settings:
     simulator=mujoco     or rotorpy, crazyflow, betaflight (the firmware, on Linux), torchrl_quad (ours; needs torch)
     loop=pid             only one rate loop: contract, pid, pd, or own, that of RotorPy and Betaflight; or stock,
                          Betaflight's without the gains of betaflight.txt
-    mutants=true         also fly mistakes of a port, each of which must fail
+    mutants=true         also fly mistakes of a port, most of which must fail
     scale={mass: 1.2}    fly another drone than the policy was told of
     late=1               control steps by which commands are later than the contract says
     episodes=64          fewer of the starts
@@ -54,7 +54,8 @@ def main() -> None:
     print(table(folder / "transfer.csv", bundle))
     if cfg["pictures"]:
         with naming(bundle.folder):
-            draw_transfer(bundle, cfg["simulator"], loops[0], folder / f"transfer_{cfg['simulator']}")
+            path, changes = folder / f"transfer_{cfg['simulator']}", {name: cfg[name] for name in ("scale", "late")}
+            draw_transfer(bundle, cfg["simulator"], loops[0], path, min(4, cfg["episodes"] or 4), **changes)
 
 
 def settings(arguments: list[str]) -> dict[str, Any]:

@@ -76,8 +76,13 @@ IGNORED = {  # what a person wrote, which nothing would read
     "abpt normalize=true critic.input_scale=2.0": "critic.input_scale=2.0 has no effect: normalize=true",
     "bptt actor.channels=[4]": r"actor.channels=\[4\] has no effect: env.camera=null",
     "bptt task=forest actor.recurrent=false actor.hidden_size=8": "actor.hidden_size=8 has no effect",
-    "bptt task=forest env.difficulty=hard env.density=0.1": "env.difficulty=hard has no effect: env.density is set",
-    "sapo loss.alpha=0.1 loss.target_entropy=-1.0": "loss.target_entropy=-1.0 has no effect: loss.alpha is not auto",
+    "bptt task=forest env.difficulty=hard env.gap=1.0 env.density=0.1": "env.difficulty=hard has no effect: env.dens",
+    "bptt task=forest env.scene={ground:true} env.gap=1.0": "env.gap=1.0 has no effect: env.scene is set",
+    "shac +loss.target_entropy=-1.0": "loss.target_entropy=-1.0 has no effect: loss.alpha is not auto",
+    "sapo loss.alpha=0.1 loss.alpha_init=1.0": "loss.alpha_init=1.0 has no effect: loss.alpha is not auto",
+    "pods loss.iterations=3": "loss.iterations=3 has no effect: loss.order=1",
+    "abpt buffer.fraction=null buffer.capacity=100": "buffer.capacity=100 has no effect: buffer.fraction=null",
+    "ppo env.event_discount=0.9": "env.event_discount=0.9 has no effect: PPO follows no gradient",
     "ppo +loss.entropy_coeff=0.1": "loss.entropy_coeff=0.1 has no effect: loss.entropy_bonus=false",
     "bptt logger.project=mine": "logger.project=mine has no effect: it is wandb's",
     "abpt restart_fraction=0.1": "restart_fraction=0.1 has no effect: buffer.fraction",
@@ -96,7 +101,7 @@ def test_every_setting_that_another_may_switch_off_is_one():
     for names, *_ in IDLE:
         for name in names.split():
             shipped = any(OmegaConf.select(node, name, default="") != "" for node in known)
-            assert shipped or name in ("env.difficulty", "loss.entropy_coeff"), name
+            assert shipped or name in ("env.difficulty", "env.density", "env.gap", "loss.entropy_coeff"), name
 
 
 @pytest.mark.parametrize("name", TUNED)

@@ -8,9 +8,10 @@ from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
 from torchrl_quad import HoveringEnv, load_drone, make_env
-from torchrl_quad.dynamics import quaternion
+from torchrl_quad.dynamics import DYNAMICS, Quadrotor, quaternion
 from torchrl_quad.envs import TASKS
 from torchrl_quad.envs.disturbances import Disturbance, Sensors
+from torchrl_quad.errors import DroneWarning
 
 RANDOMIZE = {"mass": {"scale": [0.8, 1.2]}, "inertia": {"scale": [0.9, 1.1]}}
 RANDOMIZE |= {"motor_time_constant": {"uniform": [0.02, 0.05]}, "linear_drag": {"normal": [0.005, 0.001]}}
@@ -208,6 +209,8 @@ def test_gradients_through_any_drone_agree_with_finite_differences():
     ({"randomize": {"any": {"delay": [0, 2.5]}}}, "delay needs two whole numbers"),
     ({"randomize": {"any": {}, "mass": {"scale": [1, 2]}}}, "any draws the whole drone, and takes ranges, such as"),
     ({"randomize": {"any": {"delay": [0, 0]}}, "observe_last_action": True}, "without a delay there are none"),
+    ({"drone": load_drone("cf2x").replace(mass=torch.tensor([0.03], requires_grad=True))}, "no gradient reaches yours"),
+    ({"drone": "kingfisher", "randomize": {"linear_drag": {"scale": [0.5, 2.0]}}}, "linear_drag is 0, and no scale"),
 )
 def test_a_distribution_of_any_drone_that_cannot_be_is_refused(options, message):
     refuses(message, any_drone, 1, **options)
@@ -333,3 +336,25 @@ def test_a_weight_may_be_changed_and_an_unknown_one_is_named():
     assert make_env("racing", num_envs=1, gate_bonus="log", weights={"gate": 3.0}).weights["gate"] == 3.0
     with pytest.raises(ValueError, match="weights: unknown term speed. Choose from: survival, position"):
         HoveringEnv(num_envs=1, weights={"speed": 1.0})
+
+
+def test_what_a_drone_says_and_another_setting_overrides_is_told():
+    worn = load_drone("cf2x", torch.float64).replace(rotor_effectiveness=torch.ones(4, dtype=torch.float64))
+    anyone, effective = any_drone(2), any_drone(2, drone=worn)
+    assert torch.equal(anyone.params.quadratic_drag, effective.params.quadratic_drag)
+    assert effective.params.rotor_effectiveness is not None
+    assert HoveringEnv(num_envs=1, drone=worn).rebuilt(drone="crazyflie_brushless").params.mass.item() > 0.04
+    start = {"velocity": 1.0, "angular_velocity": 1.0}
+    refuses("angular_velocity follows", HoveringEnv, num_envs=1, dynamics="point_mass", random_start=start)
+    with pytest.warns(DroneWarning, match="this drone has no drag, so wind does not move it"):
+        HoveringEnv(num_envs=1, drone="kingfisher", wind={"gust": 1.0})
+
+
+def test_a_model_whose_control_step_alone_is_its_own_is_not_compiled(monkeypatch):
+    class Weak(Quadrotor):
+        def control_step(self, state, action, params, wind):
+            return super().control_step(state, 0.5 * action, params, wind)
+
+    monkeypatch.setitem(DYNAMICS, "weak", Weak)
+    eager = HoveringEnv(num_envs=1, dynamics="weak")
+    refuses("Weak has a control_step of its own, which compiled steps do not call", eager.compile, backend="eager")

@@ -17,7 +17,7 @@ from torchrl_quad.deploy.judging import Judge, judge
 from torchrl_quad.deploy.simulators import make_simulator
 from torchrl_quad.deploy.simulators.mujoco import MuJoCo
 from torchrl_quad.deploy.simulators.vehicle import ContractLoop, Drone
-from torchrl_quad.deploy.transfer import MUTANTS, fly
+from torchrl_quad.deploy.transfer import MUTANTS, fly, measure
 from torchrl_quad.dynamics import FlightController
 from torchrl_quad.errors import UserError, UserValueError
 from torchrl_quad.files import read_rows
@@ -201,6 +201,7 @@ def test_a_drone_that_no_simulator_can_fly_is_refused_with_the_name_of_its_bundl
         ({"loop": ["pid"]}, "mujoco has no rate loop"),
     ):
         refuses(f"^{hovering}: {why}", fly, bundle, "mujoco", error=UserError, **options)
+    refuses("mutant must be none or one of xyzw, ", measure, bundle, "t.csv", "mujoco", "contract", "yav")
 
 
 def test_a_state_that_is_not_a_number_is_a_crash(hovering):

@@ -54,6 +54,11 @@ class TorchVectorEnv:
                 'The environment must have one action of floats and an entry "observation"; its actions are '
                 f"{type(action).__name__}, and it shows {', '.join(map(str, shown.keys()))}."
             )
+        if "depth" in shown:
+            raise UserValueError(
+                "The environment shows depth images, which plain observations leave out. Build it with camera=None, or "
+                "fly it with GymVectorEnv, whose observations are dictionaries."
+            )
         self.torchrl_env, self.closed = env, False
         self.num_envs, self.device = batch[0], env.device
         space = cast("Any", action.space)

@@ -40,7 +40,7 @@ class MPC(Controller):
 
     where f is a control step of the nominal drone, with rate loop, mixer and rotor lag, integrated as the environment
     does it. The reference gives position and velocity; its acceleration gives the attitude, by the shortest turn from
-    the present one, and the thrust. The heading is free.
+    the present one, and the thrust. The heading is free where attitude has no weight, as by default.
 
     A step of Gauss-Newton linearises f along the plan by automatic differentiation, and solves the linear-quadratic
     problem that is left by Riccati's recursion, within the bounds of the actions: iLQR (Li and Todorov 2004) with

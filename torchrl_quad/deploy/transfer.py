@@ -38,7 +38,7 @@ SHOWN = ("task", *KEY[1:], "solved", "crash", "metrics", "seconds")
 
 @dataclass(frozen=True)
 class Mutant:
-    """A mistake in a port, made on purpose: flown, it must fail."""
+    """A mistake in a port, made on purpose. Some tasks forgive some of them, as hovering forgives a late command."""
 
     about: str
     quaternion: tuple[int, ...] = (0, 1, 2, 3)  #: the order in which the bundle gets the entries of the quaternion
@@ -233,6 +233,8 @@ def measure(
     episodes: int | None = None,
 ) -> None:
     """Fly once, and add the result to a table, unless it is there; the arguments are those of :func:`fly`."""
+    if mutant not in ("none", *MUTANTS):
+        raise UserValueError(f"mutant must be none or one of {', '.join(MUTANTS)}; got {shown(mutant)}.")
     task = bundle.contract["task"]
     drone = {**(scale or {}), **({"late": late} if late else {})}
     starts = len(bundle.starts()["position"])

@@ -151,6 +151,9 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         drawn = self.disturbances.get("randomize")
         if isinstance(drawn, AnyDrone):
             self.action_delay = drawn.queue_length(action_delay)
+            if params.requires_grad:
+                raise UserValueError("randomize='any' draws the drone, so that no gradient reaches yours: detach it.")
+            params = self.nominal.replace(rotor_effectiveness=params.rotor_effectiveness)
         if self.action_delay == 0 and observe_last_action:
             raise UserValueError(
                 "observe_last_action shows commands on their way, and without a delay there are none. Leave it out."
@@ -274,10 +277,10 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
 
     def rebuilt(self, **changes: Any) -> Any:
         """The same environment with other arguments, built again: ``env.rebuilt(num_envs=8, wind=None)``. It flies the
-        same drone, from its own starts."""
+        same drone, if none is given, from its own starts."""
         now = {"compile": self._stepper.options or self.is_compiled, "device": self.device}
         env = cast(Any, type(self))(**{**self._built_with, **now, **changes})
-        if self.params is not self.nominal:
+        if self.params is not self.nominal and "drone" not in changes:
             env.set_params(self.params)
         return env
 
@@ -299,6 +302,8 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
 
     def _run(self, options: dict[str, Any] | None) -> QuadrotorEnv:
         """Run steps compiled with these options, eager for None; and the camera, which starts use, too, likewise."""
+        if options is not None:
+            config.check_forms(type(self.dynamics))
         self._stepper = Stepper(self.control_step, options)
         if isinstance(camera := self.disturbances.get("camera"), MountedCamera):
             camera.is_compiled = self.is_compiled

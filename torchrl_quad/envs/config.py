@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,7 +17,7 @@ from torchrl_quad.dynamics.gains import MAX_SUBSTEPS
 from torchrl_quad.envs.any_drone import any_drone
 from torchrl_quad.envs.disturbances import Disturbance, DroneRandomization, RandomStart, Sensors, Wind
 from torchrl_quad.envs.scenes import MountedCamera, Scene
-from torchrl_quad.errors import UserTypeError, UserValueError, shown
+from torchrl_quad.errors import DroneWarning, UserTypeError, UserValueError, shown
 from torchrl_quad.options import accepted, between, build, buildable, check_value, explained, imported
 from torchrl_quad.vision import DepthCamera
 
@@ -116,7 +117,9 @@ def build_disturbances(
     """The disturbances by name, in the order in which they act; those of a drone with worn rotors start from these."""
     chosen: dict[str, Disturbance] = {}
     if options["random_start"]:
-        chosen["random_start"] = build(RandomStart, "random_start", options["random_start"])
+        chosen["random_start"] = start = build(RandomStart, "random_start", options["random_start"])
+        if start.angular_velocity and "angular_velocity" in getattr(dynamics, "commanded", ()):
+            raise UserValueError("random_start: angular_velocity follows the command at once. Leave it out.")
     if options["randomize"]:
         worn = dynamics.nominal.replace(rotor_effectiveness=drone.rotor_effectiveness)
         drawn = any_drone(options["randomize"], drone)
@@ -126,6 +129,9 @@ def build_disturbances(
             check_flown(dynamics, params, "randomize: a drawn ")
     if options["wind"] is not None:
         chosen["wind"] = build(Wind, "wind", options["wind"])
+        drags = ("linear_drag", "quadratic_drag")
+        if not options["randomize"] and not any(drone.value(name).any() for name in drags):
+            warnings.warn("wind: this drone has no drag, so wind does not move it.", DroneWarning, stacklevel=2)
     noise, delay = options["observation_noise"] or {}, options["observation_delay"]
     sensors = build(Sensors, "observation_noise", noise, delay=delay)
     if sensors.noise_size or sensors.delay:
@@ -146,6 +152,16 @@ def check_flown(dynamics: Dynamics, params: QuadrotorParams, which: str = "") ->
         getattr(dynamics, "check_flown", lambda _: None)(params)
     except UserValueError as error:
         raise UserValueError(f"{which}{error}") from None
+
+
+def check_forms(model: type) -> None:
+    """Refuse to compile a model whose ``control_step`` alone is its own: compiled steps do not call it."""
+    levels = {name: k for k, part in reversed([*enumerate(model.__mro__)]) for name in vars(part)}
+    if levels["control_step"] < min(levels.get(x, 1000) for x in ("setpoint_rows", "rows_step", "physics_step")):
+        raise UserValueError(
+            f"{model.__name__} has a control_step of its own, which compiled steps do not call. Write setpoint_rows or "
+            "rows_step for them, too, or physics_step, which both forms call."
+        )
 
 
 def full_signature(cls: Any, base: type) -> inspect.Signature:

@@ -113,6 +113,8 @@ class DroneRandomization(Disturbance):
             least, most = check_value(f"{source}: {kind}", numbers, Pair, f"{has}.")
             if most < (0.0 if kind == "normal" else least):
                 raise UserValueError(f"{source}: {has}; got {shown(numbers)}.")
+            if kind == "scale" and not nominal.value(name).any():
+                raise UserValueError(f"{source}: {name} is 0, and no scale changes that. Give uniform: [low, high].")
         self.nominal = {name: nominal.value(name) for name in self.spec}
         # The least and the greatest of each; and for what has to lie below something else, the other way round.
         for sign in (-1.0, 1.0):

@@ -87,6 +87,8 @@ class ABPTLoss(PathwiseCriticLoss):
             raise UserValueError(
                 "ABPTLoss needs n_step_return or zero_step_return: with both off there is no objective."
             )
+        if simulated_steps and not zero_step_return:
+            raise UserValueError("simulated_steps belong to the 0-step return: leave out zero_step_return=False.")
         super().__init__(actor_network, **kwargs)
         self.simulated_steps = simulated_steps
         self.n_step_return, self.zero_step_return = n_step_return, zero_step_return

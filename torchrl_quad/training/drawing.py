@@ -43,10 +43,13 @@ def publish_flight(flight: TensorDictBase, figure: Path, page: Path, env: EnvBas
         write_replay(flight, page, env=env, title=title)
 
 
-def draw_transfer(bundle: Bundle, simulator: str, loop: str, path: Path, drones: int = 4) -> None:
-    """Film a bundle in our simulator and in another one, side by side, and write a page that plays both together."""
-    ways = (("torchrl_quad", "contract"), (simulator, loop))
-    flights = [fly(bundle, name, how, episodes=drones) for name, how in ways]
+def draw_transfer(bundle: Bundle, simulator: str, loop: str, path: Path, drones: int = 4, **changes: Any) -> None:
+    """Film a bundle in our simulator and in another one, side by side, and write a page that plays both together.
+
+    The other one flies with changes: ``scale`` and ``late``, as :func:`~torchrl_quad.deploy.transfer.fly` takes them.
+    """
+    ours_as_it_is = fly(bundle, "torchrl_quad", "contract", episodes=drones)
+    flights = [ours_as_it_is, fly(bundle, simulator, loop, episodes=drones, **changes)]
     ours, theirs = map(as_rollout, flights)
     labels = tuple(flight["simulator"] for flight in flights)
     about = {"env": environment_beside(bundle), "control_dt": bundle.contract["control_dt"]}

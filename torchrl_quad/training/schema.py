@@ -173,8 +173,9 @@ IDLE: list[tuple[str, Callable[[Any], bool], str]] = [
         for network in ("actor", "critic")
         for kind in ("constant", "inverse_sqrt")
     ),
-    ("actor.schedule actor.final_lr", lambda c: c["algorithm"] == "hybrid", "actor.max_kl sets the rate"),
-    ("actor.input_scale critic.input_scale", lambda c: c["normalize"], "normalize=true"),
+    ("actor.schedule actor.final_lr", lambda c: _kind(c) == "hybrid", "actor.max_kl sets the rate"),
+    ("actor.input_scale", lambda c: c["normalize"], "normalize=true"),
+    ("critic.input_scale", lambda c: c["normalize"] and not c["critic"].get("in_keys"), "normalize=true"),
     ("actor.channels", lambda c: c["env"].get("camera") is None, "env.camera=null"),
     ("actor.vision", lambda c: c["env"].get("camera") is None and c["actor"]["vision"], "env.camera=null"),
     ("actor.channels", lambda c: not c["actor"]["vision"], "actor.vision=false"),
@@ -184,17 +185,31 @@ IDLE: list[tuple[str, Callable[[Any], bool], str]] = [
         lambda c: c["actor"]["recurrent"] is None and not _may_remember(c),
         "a policy that sees nothing has a memory only with actor.recurrent=true",
     ),
-    ("loss.alpha_init loss.target_entropy", lambda c: c["loss"].get("alpha") != "auto", "loss.alpha is not auto"),
+    ("loss.alpha_init", lambda c: c["loss"].get("alpha") != "auto", "loss.alpha is not auto"),
+    (
+        "loss.target_entropy",  # in whose size SAPO measures the entropy
+        lambda c: c["loss"].get("alpha") != "auto" and _kind(c) != "sapo",
+        "loss.alpha is not auto",
+    ),
     (
         "loss.alpha loss.average_over_horizon actor.max_kl",
-        lambda c: c["algorithm"] == "train",
+        lambda c: _kind(c) == "train",
         "the policy is fitted to actions",
     ),
+    ("loss.iterations", lambda c: c["loss"].get("order") == 1, "loss.order=1"),
+    ("env.event_discount", lambda c: _kind(c) == "ppo", "PPO follows no gradient through events"),
     ("loss.entropy_coeff", lambda c: c["loss"].get("entropy_bonus") is False, "loss.entropy_bonus=false"),
-    ("env.difficulty", lambda c: c["env"].get("density") is not None, "env.density is set"),
+    ("env.difficulty", lambda c: None not in map(c["env"].get, ("density", "gap")), "env.density and env.gap are set"),
+    ("env.difficulty env.density env.gap", lambda c: c["env"].get("scene") is not None, "env.scene is set"),
     ("logger.project logger.group logger.mode", lambda c: c["logger"]["backend"] != "wandb", "it is wandb's"),
     ("restart_fraction", lambda c: c.get("buffer", {}).get("fraction") is not None, "buffer.fraction is set"),
+    ("buffer.capacity", lambda c: c["buffer"]["fraction"] is None, "buffer.fraction=null"),
 ]
+
+
+def _kind(c: Any) -> str:
+    """The recipe that ships, on whose configuration another may rest."""
+    return OWN.get(c["algorithm"], (c["algorithm"],))[0]
 
 
 def _may_remember(c: Any) -> bool:

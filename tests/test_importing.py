@@ -87,18 +87,33 @@ ROTORS["rotor_configuration"] = {
 PLUS = {"rotor_positions": [(0.2, 0), (0, 0.2), (-0.2, 0), (0, -0.2)], "rotor_spin": [1, -1, 1, -1]}
 PLUS |= {"thrust_map": [8e-6, 0, 0], "yaw_torque_coefficient": 0.016, "inertia": [0.007, 0.008, 0.012]}
 REST = {"motor_time_constant": 0.03, "linear_drag": [0.1] * 3}
-SPINS = (-0.04, -0.04, 0.04, 0.04)
-SITES = "".join(f"<site name='s{i}' pos='{x} {y} 0.1'/>" for i, (x, y) in enumerate(CORNERS))
-MJCF = (
-    "<mujoco><size memory='9000G'/><default><geom material='m'/><general ctrllimited='true' ctrlrange='0 3'/></default>"
-    "<asset><mesh file='gone.obj' name='a'/><texture name='t' file='gone.png'/><material name='m' texture='t'/></asset>"
-    "<worldbody><geom type='plane' size='1 1 1'/><body name='x' euler='0 0 90' pos='0 0 3'><freejoint/>"
-    "<inertial pos='0 0 0' mass='1' diaginertia='0.01 0.02 0.025'/><geom type='mesh' mesh='a'/>"
-    f"<body><joint name='spin' axis='0 0 1'/><geom size='0.1' mass='1'/>{SITES}</body></body></worldbody><actuator>"
-    + "".join(
-        f"<general site='s{i}' gear='0 0 2 0 0 {x}' dyntype='filter' dynprm='0.05'/>" for i, x in enumerate(SPINS)
-    )
-    + "</actuator></mujoco>"
+TURNED = "".join(
+    f"<body pos='{x} {y} 0.1'><joint name='spin{i}' axis='0 0 1'/><geom size='0.1' mass='0.25'/><site name='s{i}'/>"
+    "</body>"
+    for i, (x, y) in enumerate(CORNERS)
+)
+PUSHED = "".join(
+    f"<general site='s{i}' gear='0 0 2 0 0 {x}' dyntype='filter' dynprm='0.05'/>"
+    for i, x in enumerate((-0.04, -0.04, 0.04, 0.04))
+)
+MJCF = f"""<mujoco><size memory='9000G'/>
+<default><geom material='m'/><general ctrllimited='true' ctrlrange='0 3'/></default>
+<asset><mesh file='gone.obj' name='a'/><texture name='t' type='2d' file='gone.png'/><material name='m' texture='t'/>
+<hfield name='h' nrow='9' ncol='9' size='1 1 1 1'/></asset>
+<worldbody><geom type='hfield' hfield='h'/>
+<body name='x' euler='0 0 90' pos='0 0 3'><freejoint/><inertial pos='0 0 0' mass='1' diaginertia='0.01 0.02 0.025'/>
+<geom type='mesh' mesh='a' mass='0'/>{TURNED}</body>
+<body name='load'><freejoint/><geom size='0.1' mass='0.1'/><site name='hook'/></body></worldbody>
+<tendon><spatial material='m'><site site='s0'/><site site='hook'/></spatial></tendon>
+<actuator>{PUSHED}<motor site='hook' gear='0 0 0 1 0 0'/></actuator></mujoco>"""
+BIASED = MJCF.replace("ctrlrange='0 3'", "ctrlrange='-1 1' gainprm='1.5' biastype='affine' biasprm='1.5'")
+HELD_FORCE = MJCF.replace("ctrlrange='0 3'", "ctrlrange='0 30' forcelimited='true' forcerange='0 3'")
+PULLED = MJCF.replace("ctrlrange='0 3'", "ctrlrange='-3 0'").replace("gear='0 0 2", "gear='0 0 -2")
+STOOD = MJCF.replace("<freejoint/><inertial", "<joint type='slide'/><joint name='b' type='ball'/><inertial")
+STOOD = STOOD.replace("<body name='x'", "<body><joint axis='1 0 0'/><geom size='1' mass='7'/><body name='x'")
+STOOD = STOOD.replace("</body>\n<body name='load'", "</body></body><body name='load'")
+BY_GEOMS = MJCF.replace("<mujoco>", "<mujoco><compiler inertiafromgeom='true'/>").replace(
+    "<geom type='mesh' mesh='a' mass='0'/>", "<geom size='0.1' mass='0.9'/>"
 )
 TILTING = "<joint name='k' type='fixed'><parent>arm</parent><child>x::rotor_0</child></joint>"
 TILTING += "<joint name='tilt' type='revolute'><parent>base_link</parent><child>arm</child><axis><xyz>0 1 0</xyz>"
@@ -142,9 +157,13 @@ HOVER, FAST = np.sqrt(9.81 * 2 / 4 / 1e-5), 2 * np.pi / 60  # of a rotor of the 
     ("x.toml", CRAZYFLOW, {}, {"linear_drag": [0.02, 0.02, 0.03], "motor_time_constant": [
      1 / (10 + 2e-4 * HOVER_RPM), 1 / (4e-4 * HOVER_RPM)]}),
     ("x.xml", MJCF, {"rotor_speed_max": 1000, "linear_drag": [0.1] * 3}, {"mass": 2, "rotor_positions": CORNERS,
-     "inertia": [0.014, 0.024, 0.029], "rotor_spin": [-1, -1, 1, 1], "yaw_torque_coefficient": 0.02,
+     "inertia": [0.029, 0.069, 0.079], "rotor_spin": [-1, -1, 1, 1], "yaw_torque_coefficient": 0.02,
      "thrust_map": [6e-6, 0, 0], "motor_time_constant": 0.05}),
-    ("x.xml", MJCF, {"thrust_map": [6e-6, 0, 0], "linear_drag": [0.1] * 3}, {"rotor_speed_max": 1000}),
+    *(("x.xml", text, {"thrust_map": [6e-6, 0, 0], "linear_drag": [0.1] * 3}, {"rotor_speed_max": 1000, "mass": 2})
+      for text in (BIASED, HELD_FORCE, STOOD)),
+    ("x.xml", PULLED, {"rotor_speed_max": 1000, "linear_drag": [0.1] * 3}, {"thrust_map": [6e-6, 0, 0],
+     "rotor_spin": [1, 1, -1, -1]}),
+    ("x.xml", BY_GEOMS, {"rotor_speed_max": 1000, "linear_drag": [0.1] * 3}, {"mass": 1.9}),
 )  # fmt: skip
 def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_given(file, text, given, wanted, tmp_path):
     path = tmp_path / file
@@ -193,18 +212,24 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_given(
     ("x.xml", "<mujoco/>", "no body of it has a mass"),
     ("x.xml", "<mujoco><worldbody><body/></worldbody></mujoco>", "no body of it has a mass"),
     ("x.xml", "<mujoco><world/></mujoco>", "MuJoCo does not read it: .*unrecognized element"),
-    ("x.xml", MJCF, r"does not say thrust_map .* from ctrlrange, 6 N, once rotor_speed_max is known, rotor_speed_max"),
+    ("x.xml", MJCF, r"thrust_map .* from 6 N, the most of its actuators, and rotor_speed_max, rotor_speed_m"),
     ("x.xml", MJCF.replace(" 2 0 0", " 0 0 0"), "rotor_positions .* no actuators push at sites, one for each rotor"),
-    ("x.xml", MJCF.replace("axis='0", "axis='9"), "the joint 'spin' turns rotors, and rotors here are fixed"),
-    ("x.xml", MJCF.replace("ctrlrange='0 3'/", "ctrlrange='0 3'/><replicate/"), "a drone needs no <replicate>"),
-    ("x.xml", "<mujoco><include file='x.xml'/></mujoco>", "x.xml', which is not there or includes itself"),
-    (
-        "x.xml",
-        MJCF.replace("</worldbody>", "<body name='y'><geom size='1'/><site name='t'/></body></worldbody>")
-        .replace("'s3'", "'t'", 2)
-        .replace("'t' pos", "'s3' pos"),
-        r"rotors push several drones, \['x', 'y'\]. Leave one",
-    ),
+    ("x.xml", MJCF.replace(" ctrllimited='true'", " ctrllimited='false'"), "thrust_map .* no range bounds the force"),
+    ("x.xml", MJCF.replace("name='spin0' axis='0", "name='k' axis='9"), "the joint 'k' turns rotors, and rotors"),
+    ("x.xml", MJCF.replace("name='spin0'", "name='k' type='ball'"), "the joint 'k' turns rotors, and rotors"),
+    ("x.xml", MJCF.replace("name='spin0'", "name='k' pos='1 0 0'"), "the joint 'k' turns rotors, and rotors"),
+    ("x.xml", MJCF.replace("0 0 2 0 0", "0 0 2 1 0"), "the gear of a rotor turns across its thrust"),
+    ("x.xml", MJCF.replace("0 0 2 0 0", "2 0 0 0 0"), "its rotors do not push along the body's z axis"),
+    ("x.xml", MJCF.replace("</default>", "</default><replicate/>"), "a drone needs no such <replicate>"),
+    ("x.xml", MJCF.replace("memory=", "nkey='300000' memory="), "a drone needs no such <size>"),
+    ("x.xml", MJCF.replace("nrow='9'", "nrow='90000'"), "a drone needs no such <hfield>"),
+    ("x.xml", MJCF.replace("</asset>", "<model name='d' file='x.xml'/></asset>"), "a drone needs no such <model>"),
+    ("x.xml", MJCF.replace("</asset>", "</asset>{#<replicate/>#}"), "MuJoCo reads UTF-8, and no comments of Jinja"),
+    ("x.xml", MJCF.replace("ctrlrange='0 3'", "ctrlrange='0 nan'"), "some of its numbers are nan"),
+    ("x.XML", MJCF, "names end in .xml. Rename it"),
+    ("x.xml", "<mujoco><include file='x.xml'/></mujoco>", "includes 'x.xml', which is included twice"),
+    ("x.xml", "<mujoco><include file='y.xml'/></mujoco>", "includes 'y.xml', which is not there"),
+    ("x.xml", MJCF.replace("gear='0 0 0 1", "gear='0 0 1 1"), r"rotors push several drones, \['load', 'x'\]. Leave"),
     ("x.json", "5", "this file is of no kind that is known. These can be read"),
     ("x.json", "[1]", "this file is of no kind that is known. These can be read"),
     ("x.json", json.dumps({"dynamics": {**L2F, "rotor_positions": [1, 2]}}),

@@ -182,6 +182,8 @@ def _examples(found: Found) -> dict[str, str]:
     examples["linear_drag"] = str([float(f"{0.3 * heavy:.2g}")] * 3)
     arm = 0.14 if places is None else np.linalg.norm(np.asarray(places, float)[:, :2], axis=1).max()
     examples["inertia"] = str([float(f"{share * heavy * arm**2:.2g}") for share in (0.3, 0.3, 0.5)])
+    if axes := re.search(r"beside (\[.*?\])", found.get("inertia", (None, ""))[1]):  # whose products are not small
+        examples["inertia"] = axes[1]
     if "rotor_direction" in found and found["rotor_direction"][0] is None:
         examples["rotor_direction"] = str([[0, 0, 1]] * n)
     return {name: example.replace(" ", "") for name, example in examples.items()}  # one word of a command line

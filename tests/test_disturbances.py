@@ -344,8 +344,6 @@ def test_what_a_drone_says_and_another_setting_overrides_is_told():
     assert torch.equal(anyone.params.quadratic_drag, effective.params.quadratic_drag)
     assert effective.params.rotor_effectiveness is not None
     assert HoveringEnv(num_envs=1, drone=worn).rebuilt(drone="crazyflie_brushless").params.mass.item() > 0.04
-    start = {"velocity": 1.0, "angular_velocity": 1.0}
-    refuses("angular_velocity follows", HoveringEnv, num_envs=1, dynamics="point_mass", random_start=start)
     with pytest.warns(DroneWarning, match="this drone has no drag, so wind does not move it"):
         HoveringEnv(num_envs=1, drone="kingfisher", wind={"gust": 1.0})
 

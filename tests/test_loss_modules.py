@@ -153,7 +153,6 @@ def test_the_example_of_a_loss_is_short_and_runs(loss):
     (ABPTLoss, {"reduction": "median"}, "reduction must be 'mean', 'sum' or 'none', got 'median'"),
     (ABPTLoss, {"n_step_return": False, "zero_step_return": False}, "with both off there is no objective"),
     (ABPTLoss, {"zero_step_return": False, "simulated_steps": 3}, "simulated_steps belong to the 0-step return"),
-    (SHACLoss, {"target_bootstrap": True, "delay_value": False}, "target_bootstrap takes the target critic, which"),
     (ABPTLoss, {"n_step_return": "abc"}, "n_step_return must be true or false, got 'abc'. Whether J includes J_N"),
     (ABPTLoss, {"num_qvalue_nets": 0}, "num_qvalue_nets must be at least 1, got 0. The critics made from it"),
     (ABPTLoss, {"simulated_steps": -1}, "simulated_steps must be at least 0, got -1. Simulated control steps"),

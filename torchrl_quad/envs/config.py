@@ -117,9 +117,7 @@ def build_disturbances(
     """The disturbances by name, in the order in which they act; those of a drone with worn rotors start from these."""
     chosen: dict[str, Disturbance] = {}
     if options["random_start"]:
-        chosen["random_start"] = start = build(RandomStart, "random_start", options["random_start"])
-        if start.angular_velocity and "angular_velocity" in getattr(dynamics, "commanded", ()):
-            raise UserValueError("random_start: angular_velocity follows the command at once. Leave it out.")
+        chosen["random_start"] = build(RandomStart, "random_start", options["random_start"])
     if options["randomize"]:
         worn = dynamics.nominal.replace(rotor_effectiveness=drone.rotor_effectiveness)
         drawn = any_drone(options["randomize"], drone)

@@ -74,8 +74,6 @@ class SHACLoss(PathwiseCriticLoss):
         delay_value: bool = True,
         **kwargs: Any,
     ) -> None:
-        if target_bootstrap and not delay_value:
-            raise UserValueError("target_bootstrap takes the target critic, which delay_value=False leaves out.")
         super().__init__(actor_network, **kwargs)
         self.terminal_gradient, self.target_bootstrap = terminal_gradient, target_bootstrap
         self.average_over_horizon = average_over_horizon

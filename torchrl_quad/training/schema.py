@@ -197,7 +197,11 @@ IDLE: list[tuple[str, Callable[[Any], bool], str]] = [
         "the policy is fitted to actions",
     ),
     ("loss.iterations", lambda c: c["loss"].get("order") == 1, "loss.order=1"),
-    ("env.event_discount", lambda c: _kind(c) == "ppo", "PPO follows no gradient through events"),
+    (
+        "env.event_discount",
+        lambda c: _kind(c) == "ppo" and c["env"].get("event_discount"),
+        "PPO follows no gradient through events",
+    ),
     ("loss.entropy_coeff", lambda c: c["loss"].get("entropy_bonus") is False, "loss.entropy_bonus=false"),
     ("env.difficulty", lambda c: None not in map(c["env"].get, ("density", "gap")), "env.density and env.gap are set"),
     ("env.difficulty env.density env.gap", lambda c: c["env"].get("scene") is not None, "env.scene is set"),

@@ -25,7 +25,7 @@ from typing import Any
 from torchrl_quad.deploy import load_bundle
 from torchrl_quad.deploy.contract import naming
 from torchrl_quad.deploy.simulators import simulator_class
-from torchrl_quad.deploy.transfer import MUTANTS, measure, table
+from torchrl_quad.deploy.transfer import measure, mistakes, table
 from torchrl_quad.errors import MissingPackage, UserValueError, run_program, shown
 from torchrl_quad.files import make_folder
 
@@ -45,10 +45,8 @@ def main() -> None:
     bundle = load_bundle(cfg["bundle"], on_fault="hover")
     bundle.check()
     folder = make_folder(cfg["folder"] or Path(cfg["bundle"]).resolve().parent)
-    observes_queue = "action_queue" in bundle.contract["graphs"]["observe"]["reads"]  # else its loss changes nothing
-    mistakes = [name for name in MUTANTS if observes_queue or name != "queue"] if cfg["mutants"] else []
     for loop in loops:
-        for mutant in ("none", *mistakes):
+        for mutant in ("none", *(mistakes(bundle) if cfg["mutants"] else ())):
             options = {name: cfg[name] for name in ("scale", "late", "episodes")}
             measure(bundle, folder / "transfer.csv", cfg["simulator"], loop, mutant, **options)
     print(table(folder / "transfer.csv", bundle))

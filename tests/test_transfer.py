@@ -17,7 +17,7 @@ from torchrl_quad.deploy.judging import Judge, judge
 from torchrl_quad.deploy.simulators import make_simulator
 from torchrl_quad.deploy.simulators.mujoco import MuJoCo
 from torchrl_quad.deploy.simulators.vehicle import ContractLoop, Drone
-from torchrl_quad.deploy.transfer import MUTANTS, fly, measure
+from torchrl_quad.deploy.transfer import MUTANTS, fly, measure, mistakes
 from torchrl_quad.dynamics import FlightController
 from torchrl_quad.errors import UserError, UserValueError
 from torchrl_quad.files import read_rows
@@ -236,6 +236,9 @@ def test_the_recipe_flies_without_torch_keeps_a_table_and_finds_mistakes_of_a_po
     assert failed >= {"xyzw", "yaw", "heading", "motors", "frd"}
     launch("transfer", *settings, "mutants=true")  # finds all of it there
     assert read_rows(tmp_path / "transfer.csv") == table
+    bundle = load_bundle(hovering)
+    bundle.contract["output"]["control"], bundle.contract["action_delay"] = "rotor_thrusts", 0
+    assert mistakes(bundle) == ["xyzw", "heading", "motors", "frd_gyro"]
 
 
 def test_the_recipe_films_a_flight_beside_ours(hovering, tmp_path, launch, monkeypatch):

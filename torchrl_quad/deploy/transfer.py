@@ -62,6 +62,17 @@ MUTANTS = {
 }
 
 
+def mistakes(bundle: Bundle) -> list[str]:
+    """The names of the mutants that change something for a bundle."""
+    contract = bundle.contract
+    idle = {
+        "queue": "action_queue" not in contract["graphs"]["observe"]["reads"],
+        "delay": contract["action_delay"] == 0,
+        **dict.fromkeys(("yaw", "frd"), contract["output"]["control"] == "rotor_thrusts"),
+    }
+    return [name for name in MUTANTS if not idle.get(name)]
+
+
 def fly(
     folder: str | Path | Bundle,
     simulator: str,

@@ -20,7 +20,7 @@ def main(cfg: DictConfig) -> None:
     run = Run(cfg, env, actor, loss, [actor_optimizer, critic_optimizer, scale])
     for _ in run:
         # Until nine tenths of the episodes are solved, or returns level off, the discount looks half as far ahead.
-        loss.value_estimator.gamma.fill_(cfg.gamma if run.looks_ahead else 2.0 * cfg.gamma - 1.0)
+        loss.value_estimator.gamma.fill_(cfg.gamma if run.looks_ahead else max(2.0 * cfg.gamma - 1.0, 0.0))
         run.horizon = loss.horizon
         # The actor: towards actions that raise the return of one horizon and the value of its end.
         rollout, end = differentiable_rollout(env, actor, run.carry, run.horizon)

@@ -82,6 +82,7 @@ IGNORED = {  # what a person wrote, which nothing would read
     "sapo loss.alpha=0.1 loss.alpha_init=1.0": "loss.alpha_init=1.0 has no effect: loss.alpha is not auto",
     "pods loss.iterations=3": "loss.iterations=3 has no effect: loss.order=1",
     "abpt buffer.fraction=null buffer.capacity=100": "buffer.capacity=100 has no effect: buffer.fraction=null",
+    "bptt task=forest actor.recurrent=false actor={hidden_size:8}": "actor.hidden_size=8 has no effect: actor.rec",
     "ppo env.event_discount=0.9": "env.event_discount=0.9 has no effect: PPO follows no gradient",
     "ppo +loss.entropy_coeff=0.1": "loss.entropy_coeff=0.1 has no effect: loss.entropy_bonus=false",
     "bptt logger.project=mine": "logger.project=mine has no effect: it is wandb's",

@@ -9,11 +9,12 @@ from __future__ import annotations
 import difflib
 import inspect
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, cast
 
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, MissingMandatoryValue, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
@@ -245,7 +246,7 @@ def check(cfg: DictConfig, overrides: Sequence[str] = ()) -> None:
         raise UserValueError(f"{name} is missing: write {name}=... on the command line.") from None
     except OmegaConfBaseException as error:
         raise UserValueError(f"{error.full_key or 'the configuration'}: {str(error).splitlines()[0]}") from None
-    asked = {name.lstrip("+~"): value for name, _, value in (override.partition("=") for override in overrides)}
+    asked = dict(pair for override in overrides for pair in _asked(override))
     schema = schema_of(values, asked)
     try:
         schema.model_validate(values)
@@ -254,6 +255,17 @@ def check(cfg: DictConfig, overrides: Sequence[str] = ()) -> None:
     if "algorithm" in values:
         as_disturbances(values.get("env", {}).get("disturbances") or (), "env.disturbances")
         _check_together(values, asked)
+
+
+def _asked(override: str) -> Iterator[tuple[str, Any]]:
+    """The name and the value of an override, and of each entry of a mapping."""
+    name, _, value = override.partition("=")
+    todo = [(name.lstrip("+~"), OverridesParser.create().parse_override(override).value())] if "{" in value else []
+    yield name.lstrip("+~"), value
+    for name, mapping in todo:
+        for key, x in mapping.items() if isinstance(mapping, dict) else ():
+            yield f"{name}.{key}", x
+            todo.append((f"{name}.{key}", x))
 
 
 def schema_of(values: dict[str, Any], asked: Mapping[str, str] = MappingProxyType({})) -> type[BaseModel]:

@@ -64,13 +64,13 @@ MUTANTS = {
 
 def mistakes(bundle: Bundle) -> list[str]:
     """The names of the mutants that change something for a bundle."""
-    contract = bundle.contract
-    idle = {
-        "queue": "action_queue" not in contract["graphs"]["observe"]["reads"],
-        "delay": contract["action_delay"] == 0,
-        **dict.fromkeys(("yaw", "frd"), contract["output"]["control"] == "rotor_thrusts"),
-    }
-    return [name for name in MUTANTS if not idle.get(name)]
+    delay, reads = bundle.contract["action_delay"], bundle.contract["graphs"]["observe"]["reads"]
+
+    def is_idle(mutant: Mutant) -> bool:
+        signs = mutant.commanded != Mutant.commanded and (_commanded(bundle, mutant) > 0.0).all()
+        return bool(signs) or mutant.delay == delay or not (mutant.keeps_queue or "action_queue" in reads)
+
+    return [name for name, mutant in MUTANTS.items() if not is_idle(mutant)]
 
 
 def fly(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import warnings
-import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ MOST = 2000  # bodies, and what a file may ask memory for
 ACROSS = 0.02  # the share of a torque that may be across the thrust; and how far from a rotor its joint may be [m]
 
 
-def read_mjcf(root: ET.Element, path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
+def read_mjcf(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
     """What the bodies and actuators of MuJoCo's own format say, which MuJoCo itself reads.
 
     A rotor is an actuator that pushes at a site. Its gear says where to, and how much it turns the drone.
@@ -77,7 +76,7 @@ def read_mjcf(root: ET.Element, path: Path, given: Found) -> tuple[str, str, Fou
     others = [x for x in range(1, model.nbody) if model.body_jntnum[x] and x not in own and model.body_rootid[x] == x]
     unread = [f"the body {model.body(x).name or x}, which moves by itself" for x in others if x not in shared]
     unread += ["drag of MuJoCo's air (density, viscosity)"] if model.opt.density or model.opt.viscosity else []
-    unread += ["drag of joints (damping)"] if any(model.dof_damping[x] for x in range(model.nv)) else []
+    unread += ["drag of joints (damping)"] if model.dof_damping.any() else []
     unread += [f"the actuator {model.actuator(i).name or i}, which is no rotor" for i in at_sites if i not in some]
     if rotors:
         turning = (gear[:, :3] * gear[:, 3:]).sum(1) / np.square(gear[:, :3]).sum(1)

@@ -199,8 +199,9 @@ def _read(drone: Any, entry: str | None, fields: Mapping[str, Any]) -> tuple[str
         if entry is not None:
             raise UserValueError(f"{drone} holds one drone. Leave out entry={shown(entry)}.")
         root = read_tree(Path(drone))
-        reader = read_mjcf if root.tag == "mujoco" else read_model
-        return reader(root, Path(drone), usable(fields))
+        if root.tag == "mujoco":
+            return read_mjcf(Path(drone), usable(fields))
+        return read_model(root, Path(drone), usable(fields))
     if suffix == ".json":
         source, data = str(drone), read_json(Path(drone))
         data = data if isinstance(data, Mapping) else {}

@@ -147,6 +147,11 @@ def test_an_action_of_another_shape_or_kind_is_refused_and_not_broadcast(action,
 def test_parameters_and_policies_that_do_not_fit_are_refused(env):
     with pytest.raises(TypeError, match="params must be QuadrotorParams, such as env.params.replace.*; got str"):
         env.params = "visfly"
+    with pytest.raises(ValueError, match="rate_gain would change nothing here: the flight controller keeps the nom"):
+        env.params = env.params.replace(rate_gain=[10.0] * 3)
+    drawn = HoveringEnv(num_envs=4, randomize={"mass": {"scale": [0.8, 1.2]}})
+    with pytest.raises(ValueError, match="randomize draws mass in each episode, .* leave that field out of randomize"):
+        drawn.params = drawn.params.replace(mass=0.5)
     with pytest.raises(ValueError, match='there is none. A policy writes it under "action", as make_actor.env. does'):
         differentiable_rollout(env, linear(13, 4, out_key="acton"), None, 2)
 

@@ -152,6 +152,22 @@ def check_flown(dynamics: Dynamics, params: QuadrotorParams, which: str = "") ->
         raise UserValueError(f"{which}{error}") from None
 
 
+def check_changes(dynamics: Dynamics, params: QuadrotorParams, drawn: Disturbance | None) -> None:
+    """Refuse a drone that is to fly if it differs from the nominal one in nothing that flies, or in what is drawn."""
+    nominal, names = dynamics.nominal, (*params.fields(), *dynamics.nominal.fields())
+    changed = {k for k in names if (params.value(k) != nominal.value(k)).any()}
+    if lost := sorted(changed & set(drawn.spec if isinstance(drawn, DroneRandomization) else ())):
+        raise UserValueError(
+            f"params: randomize draws {', '.join(lost)} in each episode, so that this would change nothing. Build the "
+            "environment with this drone, or leave that field out of randomize."
+        )
+    if changed and not changed & set(dynamics.plant_fields):
+        raise UserValueError(
+            f"params: {', '.join(sorted(changed))} would change nothing here: the flight controller keeps the nominal "
+            "drone. Build the environment with it: HoveringEnv(drone=params)."
+        )
+
+
 def check_forms(model: type) -> None:
     """Refuse to compile a model whose ``control_step`` alone is its own: compiled steps do not call it."""
     levels = {name: k for k, part in reversed([*enumerate(model.__mro__)]) for name in vars(part)}

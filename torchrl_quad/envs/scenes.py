@@ -81,6 +81,7 @@ class Scene(Disturbance):
     constants: Primitives  #: the fixed obstacles, in the precision and on the device of a drone
     touchable: Primitives  #: the same without the ground
     radius: float  #: of the drone [m]
+    was_drawn = False
 
     def __init__(
         self,
@@ -140,7 +141,8 @@ class Scene(Disturbance):
         """Draw the obstacles, and check that no drone starts within one."""
         drawn: State = {("scene", kind): x for kind, x in self.draw(random, state).items()}
         state = {**state, **drawn}
-        if looks_are_free(random.device):
+        if looks_are_free(random.device) or not self.was_drawn:  # on a GPU at first only, which waits for the answer
+            self.was_drawn = True
             for problem, where in self.problems(state).items():
                 if where.any():
                     place = [round(x, 2) for x in state["position"][where][0].tolist()]

@@ -17,7 +17,7 @@ from torch.distributions.transforms import TanhTransform
 from torchrl.objectives.utils import ValueEstimators
 
 from torchrl_quad.data.unwrap import check_tensordict, leaf
-from torchrl_quad.errors import UserValueError, WrongState
+from torchrl_quad.errors import Unsupported, UserValueError, WrongState
 from torchrl_quad.objectives.calls import holding, plain_of, takes_rollout
 from torchrl_quad.objectives.shac import SHACLoss
 from torchrl_quad.options import Below1, Coefficient, Field, Positive, Share
@@ -100,6 +100,9 @@ class HybridLoss(SHACLoss):
         self.out_keys += ["entropy"] * (entropy_coeff > 0)
         weight = torch.full((), math.nan, device=self._default_device, dtype=self._precision)
         self.register_buffer("pathwise_weight", weight)
+
+    def _add_entropy_bonus(self) -> None:
+        raise Unsupported(f"{type(self).__name__} has an entropy bonus of its own: set entropy_coeff, and leave alpha.")
 
     def _network_in_keys(self) -> set[NestedKey]:
         return super()._network_in_keys() | self._drawn_keys

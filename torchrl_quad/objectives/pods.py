@@ -72,6 +72,9 @@ class PODSLoss(PathwiseLoss):
         super().__init__(actor_network, clip_action_gradient=clip_action_gradient, **own)
         self.order, self.step, self.iterations = order, step, iterations
 
+    def _add_entropy_bonus(self) -> None:
+        raise Unsupported(f"{type(self).__name__} has no entropy bonus: leave alpha at 0.")
+
     def write_action_target(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add ``action_target``, the actions to learn, to a rollout (*, horizon) that carries its graph."""
         if self.order == 1:

@@ -75,6 +75,11 @@ class SHACLoss(PathwiseCriticLoss):
         **kwargs: Any,
     ) -> None:
         super().__init__(actor_network, **kwargs)
+        if target_bootstrap and not terminal_gradient:
+            raise UserValueError(
+                "target_bootstrap says whose value ends the horizon, and terminal_gradient=False cuts its gradient, so "
+                "that it would change nothing. Leave one of them out."
+            )
         self.terminal_gradient, self.target_bootstrap = terminal_gradient, target_bootstrap
         self.average_over_horizon = average_over_horizon
         self._add_critics(value_network, None if num_value_nets == 1 else num_value_nets, "num_value_nets", delay_value)

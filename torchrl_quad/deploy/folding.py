@@ -44,13 +44,15 @@ def fold(
         raise UserValueError(f"export_policy: actions must lie from -1 to 1, got {plain.low} to {plain.high}.")
     pairs, eyes = [*zip(plain.weights[::2], plain.weights[1::2], strict=True)], len(plain.lenses)
     activations = [*plain.lenses, *plain.activations]
-    pairs = [*pairs[: len(activations)], pairs[-1]]  # between them stands the memory
+    memory = None
+    if plain.memory:  # between the first two layers
+        memory = Memory(*(_numbers(x).astype(np.float32) for pair in pairs[eyes + 1 : eyes + 3] for x in pair))
+        del pairs[eyes + 1 : eyes + 3]
     layers = [_layer(*pair, x) for pair, x in zip(pairs, [*activations, nn.Tanh()], strict=True)]
     layers[eyes] = _reading(layers[eyes], np.repeat(plain.scales, plain.widths), normalizer)
     last = layers[-1]
     layers[-1] = last._replace(weight=last.weight[: plain.size], bias=last.bias[: plain.size])  # the rest is noise's
     layers = [Layer(weight.astype(np.float32), bias.astype(np.float32), x) for weight, bias, x in layers]
-    memory = Memory(*(_numbers(x).astype(np.float32) for x in plain.weights[-6:-2])) if plain.memory else None
     height, width = image or (0, 0)
     network = Network(layers[eyes:], layers[:eyes], (height, width), plain.nearest, memory, plain.head.max_loc)
     if eyes and (image is None or network.features != plain.widths[0] or layers[0].weight.shape[1] != 1):

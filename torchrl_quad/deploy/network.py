@@ -58,13 +58,13 @@ class Memory(NamedTuple):
 
 
 class Network(NamedTuple):
-    """A policy: layers; of a visual one also convolutions before them, and a memory beside the last one."""
+    """A policy: layers; of a visual one also convolutions before them; and a memory between the first two."""
 
     layers: list[Layer]  #: the first reads the features of the image, then the observation; the last gives the action
     convolutions: Sequence[Layer] = ()
     image: tuple[int, int] = (0, 0)  #: height and width
     nearest: float = 0.0  #: the convolutions read 1 / max(depth, nearest) [m]
-    memory: Memory | None = None  #: reads what the last layer reads, which then reads the memory, too
+    memory: Memory | None = None  #: reads what the first layer gives; the second one reads both
     max_loc: float = math.inf  #: the largest sum of the last layer
 
     @property
@@ -95,10 +95,11 @@ class Network(NamedTuple):
 
     def weights(self) -> Iterator[Array]:
         """All weights and biases, in the order in which they are used."""
-        for layer in (*self.convolutions, *self.layers[:-1]):
+        for layer in (*self.convolutions, self.layers[0]):
             yield from layer[:2]
         yield from self.memory or ()
-        yield from self.layers[-1][:2]
+        for layer in self.layers[1:]:
+            yield from layer[:2]
 
 
 # -- ONNX --------------------------------------------------------------------------------------------------------------
@@ -140,8 +141,7 @@ def write_onnx(network: Network) -> ModelProto:
         for i, layer in enumerate(network.convolutions):
             image = run(layer, image, f"convolution_{i}")
         x = add("Concat", [add("Flatten", [image], "features"), x], "features_and_observation", axis=1)
-    for i, layer in enumerate(network.layers[:-1]):
-        x = run(layer, x, f"{i}")
+    x = run(network.layers[0], x, "0")
     if network.memory:
         at = constant("axis", [0], np.int64)
         weight, bias, own_weight, own_bias = (  # of the update gate, the reset gate, and the new value
@@ -153,7 +153,8 @@ def write_onnx(network: Network) -> ModelProto:
         size = network.memory.own_weight.shape[1]
         after = add("GRU", reads, "after", hidden_size=size, linear_before_reset=1)
         x = add("Concat", [x, add("Squeeze", [after, at], "next_memory")], "recalled", axis=1)
-    x = run(network.layers[-1], x, f"{len(network.layers) - 1}")
+    for i, layer in enumerate(network.layers[1:], 1):
+        x = run(layer, x, f"{i}")
     add("Clip", [x, constant("low", -network.limit), constant("high", network.limit)], "action")
     shapes = network.reads
     written = {"action": (len(network.layers[-1].bias),)}
@@ -215,7 +216,7 @@ def write_c(network: Network, contract: Contract, vectors: Mapping[str, Array]) 
         **dict(zip(("rows", "columns"), network.image, strict=True)),
         "width": max(between),  # floats between the steps
         "features": network.features,
-        "recalled": network.layers[-1].weight.shape[1],
+        "recalled": network.layers[:2][-1].weight.shape[1],
         "layers": "\n".join(f"    {line}" for line in _steps(network)),
     }
     features = [*others, "rotors"] if turns_rotors else others
@@ -261,12 +262,11 @@ def _steps(network: Network) -> Iterator[str]:
         yield f"for (int i = 0; i < POLICY_OBSERVATION; ++i) features[{network.features} + i] = observation[i];"
     for i, layer in enumerate(network.layers):
         is_last = i == len(network.layers) - 1
-        if is_last and network.memory:
+        if i == 1 and network.memory:
             size, own = len(layer.weight[0]) - network.memory.own_weight.shape[1], "memory_weight, memory_bias"
             yield f"remember({own}, own_weight, own_bias, {size}, recalled, memory, recalled + {size});"
             x = "recalled"
-        reads_memory = network.memory and i == len(network.layers) - 2
-        y = "action" if is_last else "recalled" if reads_memory else next(places)
+        y = "action" if is_last else "recalled" if i == 0 and network.memory else next(places)
         rows, columns = layer.weight.shape
         yield f"sum(weight_{i}, bias_{i}, {columns}, {x}, {rows}, {y});"
         yield _activate(layer, y, rows)

@@ -56,7 +56,9 @@ def make_actor(
 
     Args:
         env: any TorchRL environment, for the sizes of its entries, the action's bounds, device and floating-point type.
-        num_cells: the width of every hidden layer, in a list: [64, 64], or [64] for a single layer.
+        num_cells: the width of every hidden layer, in a list: [64, 64], or [64] for a single layer. A memory reads the
+            first one; the others, or the head, read both. The second layer is what lets a policy change its gains by
+            what it remembers, as for :doc:`any drone <any_drone>`.
         in_keys: the entries that are concatenated into the network's input, each (*, k), in a list: ["observation"].
         activation: of the hidden layers; smooth ones give smooth policy gradients.
         input_scale: the input is multiplied by this; a number, or one for each of ``in_keys``. What the tasks observe
@@ -72,8 +74,7 @@ def make_actor(
             the step before; ``noise`` is that of the step.
         return_log_prob: whether it also writes the log-probability of the action, which an entropy bonus and PPO need.
             mu then stays between -5 and 5: further out, rounding of the action determines the log-probability.
-        recurrent: whether it has a memory: a GRU reads the last hidden layer, and the head reads both. See
-            :func:`make_visual_actor` for the entries that this adds.
+        recurrent: whether it has a memory, a GRU. See :func:`make_visual_actor` for the entries that this adds.
         hidden_size: numbers in that memory.
 
     Raises:
@@ -83,9 +84,9 @@ def make_actor(
     head = action_init, scale_init, learn_scale, noise_correlation, return_log_prob
     if recurrent:
         if not num_cells:
-            raise UserValueError("A memory reads the last hidden layer: give num_cells at least one, such as [64].")
-        trunk = network_of(env, in_keys, num_cells[-1], num_cells[:-1], activation, input_scale)
-        return _composed(env, "make_actor", Features(None, trunk, activation()), in_keys, hidden_size, *head)
+            raise UserValueError("A memory reads the first hidden layer: give num_cells at least one, such as [64].")
+        features = Features(None, network_of(env, in_keys, num_cells[0], [], activation, input_scale), activation())
+        return _composed(env, "make_actor", features, in_keys, hidden_size, num_cells[1:], activation, *head)
     options = num_cells, activation, input_scale
     return _policy(env, "make_actor", [], in_keys, lambda size: network_of(env, in_keys, size, *options), *head)
 
@@ -111,8 +112,8 @@ def make_visual_actor(
     """A tanh-Gaussian policy of a depth image and vectors, with memory or without.
 
     TorchRL's ConvNet reads the inverse of the depth, 1 / max(depth, 0.3 m), which weights near depths most. A
-    multi-layer perceptron reads its features and the vectors; its output goes to TorchRL's GRUModule, and both outputs
-    to the head.
+    layer reads its features and the vectors; its output goes to TorchRL's GRUModule, and both outputs to the further
+    layers and the head.
 
     The policy of a recurrent network also reads ``recurrent_state`` (*, 1, hidden_size) and ``is_init`` (*, 1), and
     writes ``("next", "recurrent_state")``. Environments of this package that fly without transforms hand the memory on,
@@ -124,7 +125,8 @@ def make_visual_actor(
 
     Args:
         env: any TorchRL environment with an image, for the sizes of its entries.
-        num_cells: the width of every layer between the convolutions and the memory, or the head, in a list: [64].
+        num_cells: the width of every hidden layer after the convolutions, in a list: [64]; of several the memory reads
+            the first.
         in_keys: the vectors that it reads, each (*, k), in a list: ["observation"].
         image_key: the entry of the image, (*, channels, height, width) [m].
         channels: of the convolutions, each 3 x 3, which halve height and width, in a list: [8, 16].
@@ -157,17 +159,26 @@ def make_visual_actor(
         device=env.device,
     ).to(image.dtype)
     seen = convolutions(image.zero()).shape[-1]
-    trunk = network_of(env, in_keys, num_cells[-1], num_cells[:-1], activation, input_scale, more=seen)
+    trunk = network_of(env, in_keys, num_cells[0], [], activation, input_scale, more=seen)
     features, head = Features(convolutions, trunk, activation()), (action_init, scale_init, learn_scale)
     keys, size = [image_key, *in_keys], hidden_size if recurrent else 0
-    return _composed(env, "make_visual_actor", features, keys, size, *head, noise_correlation, return_log_prob)
+    head = *head, noise_correlation, return_log_prob
+    return _composed(env, "make_visual_actor", features, keys, size, num_cells[1:], activation, *head)
 
 
 def _composed(
-    env: EnvBase, name: str, features: Features, in_keys: Sequence[NestedKey], hidden_size: int, *head: Any
+    env: EnvBase,
+    name: str,
+    features: Features,
+    in_keys: Sequence[NestedKey],
+    hidden_size: int,
+    num_cells: Sequence[int],
+    activation: Any,
+    *head: Any,
 ) -> TanhGaussianActor:
-    """A policy of features, a memory if it has a size, and a head, as :func:`_policy` takes it."""
-    width, dtype = cast(nn.Linear, features.trunk.mlp[-1]).out_features, next(features.parameters()).dtype
+    """A policy of features, a memory if it has a size, further layers, and a head, as :func:`_policy` takes it."""
+    dtype = next(features.parameters()).dtype
+    width = cast(nn.Linear, features.trunk.mlp[-1]).out_features
     parts: list[Any] = [TensorDictModule(features, in_keys=list(in_keys), out_keys=["features"])]
     widths = [width]
     if hidden_size:
@@ -183,7 +194,8 @@ def _composed(
         widths.append(hidden_size)
 
     def last(size: int) -> Network:
-        return Network(MLP(sum(widths), size, num_cells=[], device=env.device).to(dtype), [1.0] * len(widths), widths)
+        mlp = MLP(sum(widths), size, num_cells=list(num_cells), activation_class=activation, device=env.device)
+        return Network(mlp.to(dtype), [1.0] * len(widths), widths)
 
     return _policy(env, name, parts, ["features", "recalled"][: len(widths)], last, *head)
 
@@ -311,7 +323,7 @@ class TanhGaussianActor(ProbabilisticActor):
         network, keys = self.last, list(self[0].in_keys)
         if len(set(map(str, keys))) < len(keys) or not network.is_plain:  # one that reads an entry twice is called
             return None
-        return PlainTanhGaussian(self, keys[: len(network.scales)], network, list(network.mlp)[:-1])
+        return PlainTanhGaussian(self, keys[: len(network.scales)], network, list(network.mlp))
 
 
 class ComposedActor(TanhGaussianActor):
@@ -334,11 +346,11 @@ class ComposedActor(TanhGaussianActor):
             return None
         first, *memory, _ = cast(Any, self[0].module)
         features = first.module
-        if not features.trunk.is_plain or not is_pointwise(features.activation):
+        if not (features.trunk.is_plain and is_pointwise(features.activation) and self.last.is_plain):
             return None
-        trunk, convolutions = [*features.trunk.mlp, features.activation], list(features.convolutions or ())[:-1]
-        gru = memory[0].gru if memory else None
-        return PlainTanhGaussian(self, first.in_keys, features.trunk, trunk, convolutions, gru)
+        layers = [*features.trunk.mlp, features.activation, *self.last.mlp]
+        convolutions, gru = list(features.convolutions or ())[:-1], memory[0].gru if memory else None
+        return PlainTanhGaussian(self, first.in_keys, features.trunk, layers, convolutions, gru)
 
     def replayed(self) -> Replay | None:
         """The policy as losses let it act again in a whole rollout, or None if it explores in another way."""

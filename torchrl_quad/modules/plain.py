@@ -21,6 +21,7 @@ from torchrl_quad.errors import UserValueError, WrongState
 
 MEMORY = "recurrent_state"
 NEAREST = 0.3  # [m]; closer depths are clamped
+Pair = tuple[Tensor, Tensor]
 
 
 class GaussianHead(NormalParamExtractor):
@@ -108,8 +109,8 @@ class Network(nn.Module):
 class PlainTanhGaussian:
     """A tanh-Gaussian policy on plain tensors, with eyes, memory, both or neither; see the engine's ``PlainPolicy``.
 
-    It has these layers: convolutions, if it sees; a trunk; a memory, if it has one, which reads what the trunk returns;
-    and a last one, which reads both. The image has no gradient where ``without_gradient`` names it.
+    It has convolutions, if it sees, and layers; a memory, if it has one, reads what the first layer returns, and the
+    second layer reads both. The image has no gradient where ``without_gradient`` names it.
     """
 
     without_gradient: frozenset[NestedKey] = frozenset()
@@ -121,18 +122,18 @@ class PlainTanhGaussian:
         actor: Any,
         in_keys: Sequence[NestedKey],
         reader: Network,
-        trunk: Sequence[nn.Module],
+        layers: Sequence[nn.Module],
         convolutions: Sequence[nn.Module] = (),
         gru: Any = None,
     ) -> None:
         self.is_random, self.scales, self.widths = actor.is_random, reader.scales, reader.widths
-        self.sees, self.lenses, self.activations = bool(convolutions), [*convolutions[1::2]], [*trunk[1::2]]
+        self.sees, self.lenses, self.activations = bool(convolutions), [*convolutions[1::2]], [*layers[1::2]]
         self.memory = {MEMORY: (1, gru.hidden_size)} if gru else {}
         self.in_keys, self.out_keys = [*map(unravel_key, in_keys), *self.memory], list(actor.out_keys)
-        before = [(x.weight, x.bias) for x in cast(Any, [*convolutions[::2], *trunk[::2]])]
+        pairs = [(x.weight, x.bias) for x in cast(Any, [*convolutions[::2], *layers[::2]])]
         gates = [(gru.weight_ih_l0, gru.bias_ih_l0), (gru.weight_hh_l0, gru.bias_hh_l0)] if gru else []
-        last = actor.last.mlp[-1]
-        self.weights = tuple(x for pair in (*before, *gates, (last.weight, last.bias)) for x in pair)
+        first = 1 + len(self.lenses)
+        self.weights = tuple(x for pair in (*pairs[:first], *gates, *pairs[first:]) for x in pair)
         self._take_head(actor)
 
     @functools.cached_property
@@ -224,7 +225,7 @@ class PlainTanhGaussian:
         kept = self.layers(weights, inputs)
         written = self._sample(kept[-1], drawn)
         if self.memory:
-            written["next", MEMORY] = kept.pop(-2).unsqueeze(-2)
+            written["next", MEMORY] = kept.pop(self.sees + 4).unsqueeze(-2)
         return kept, {key: written[key] for key in self.out_keys}
 
     def adjoint(
@@ -236,23 +237,25 @@ class PlainTanhGaussian:
         grads: dict[NestedKey, Tensor],
     ) -> tuple[list[Tensor], list[Tensor], Tensor]:
         """What each layer read, and the gradient of what it returned; the gradients of inputs and noise."""
-        layers, seen, kept = self._after_eyes(weights), kept[: self.sees], kept[self.sees :]
+        (layers, gru), seen, kept = self._after_eyes(weights), kept[: self.sees], kept[self.sees :]
         own = {key: grads[key] for key in self.out_keys if key != ("next", MEMORY)}
         grad, grad_drawn = vjp(self._sample, kept[-1], drawn)[1](own)
-        activated = [vjp(activation, x)[:2] for activation, x in zip(self.activations, kept, strict=False)]
-        read, of_x = [self._joined(inputs, seen), *(x for x, _ in activated)], grad @ layers[-1][0]
-        of_kept, of_memory = [grad], []
-        if self.memory:
-            h, (gates, new, own_new) = inputs[-1].squeeze(-2), kept[-4:-1]
-            of_x, of_recalled = of_x.split([read[-1].shape[1], h.shape[1]], 1)
-            of_recalled = of_recalled + grads["next", MEMORY].squeeze(-2)
-            of_gates, of_own_new, of_h = gradient_before(of_recalled, h, gates, new, own_new, layers[-2][0])
-            read, of_kept = [*read, h, recalled_by(gates, new, h)], [of_gates, of_own_new, grad]
-            of_x = of_x + of_gates @ layers[-3][0]
-            of_memory = [of_h.unsqueeze(-2)]
-        for (_, pull), (weight, _) in reversed([*zip(activated, layers, strict=False)]):
+        remembered = kept[1:4] if self.memory else []
+        sums = [*kept[:1], *kept[1 + len(remembered) :]]
+        activated = [vjp(activation, x)[:2] for activation, x in zip(self.activations, sums, strict=False)]
+        read, of_memory = [self._joined(inputs, seen), *(x for x, _ in activated)], []
+        of_kept, of_x = [grad], grad @ layers[-1][0]
+        for i, (_, pull) in reversed([*enumerate(activated)]):
+            if self.memory and i == 0:
+                h, (gates, new, own_new) = inputs[-1].squeeze(-2), remembered
+                of_x, of_recalled = of_x.split([read[1].shape[1], h.shape[1]], 1)
+                of_recalled = of_recalled + grads["next", MEMORY].squeeze(-2)
+                of_gates, of_own_new, of_h = gradient_before(of_recalled, h, gates, new, own_new, gru[1][0])
+                read = [*read[:2], h, recalled_by(gates, new, h), *read[2:]]
+                of_kept, of_memory = [of_gates, of_own_new, *of_kept], [of_h.unsqueeze(-2)]
+                of_x = of_x + of_gates @ gru[0][0]
             (grad,) = pull(of_x)
-            of_kept, of_x = [grad, *of_kept], grad @ weight
+            of_kept, of_x = [grad, *of_kept], grad @ layers[i][0]
         parts = zip(of_x.split(list(self.widths), 1), self.scales, strict=True)
         of_read = [g if scale == 1.0 else g * scale for g, scale in parts]
         if not self.sees:
@@ -272,44 +275,45 @@ class PlainTanhGaussian:
         count = len(traces) // 2
         pairs = zip(traces[:count], traces[count:], strict=True)
         found = [g for x, grad in pairs for g in (grad.t() @ x, grad.sum(0))]
-        if self.memory:  # whose own layer has the first gradients of the other's, and whose head reads x as well
-            x, h = traces[count - 3 : count - 1]
-            of_gates, _, grad = traces[-3:]
-            size, (of_bias, own, own_bias, head, bias) = 2 * h.shape[1], found[-5:]
+        if self.memory:  # whose own layer has the first gradients of the other's; the second layer reads x as well
+            (x, h), (of_gates, _, grad) = traces[1:3], traces[count + 1 : count + 4]
+            size, (of_bias, own, own_bias, second) = 2 * h.shape[1], found[3:7]
             own = torch.cat((of_gates[:, :size].t() @ h, own))
-            found[-4:] = own, torch.cat((of_bias[:size], own_bias)), torch.cat((grad.t() @ x, head), 1), bias
+            found[4:7] = own, torch.cat((of_bias[:size], own_bias)), torch.cat((grad.t() @ x, second), 1)
         return [*seen, *found]
 
     def layers(self, weights: Sequence[Tensor], inputs: Sequence[Tensor], lasts: Tensor | None = None) -> list[Tensor]:
-        """What the eyes return, and each layer before its activation; before the last one, what the memory recalls.
+        """What the eyes return, and each layer before its activation; after the first one, what the memory recalls.
 
         Inputs are (n, ...). Where they are states of flights, one after another, ``lasts``, bool (flights, horizon, 1),
         says where a memory is kept from the step before; otherwise each state comes with its memory, whose gates are
         also returned.
         """
-        kept, layers = self._see(weights, inputs), self._after_eyes(weights)
+        kept, (layers, gru) = self._see(weights, inputs), self._after_eyes(weights)
         x = self._joined(inputs, kept)
-        for (weight, bias), activation in zip(layers, self.activations, strict=False):
+        for i, (weight, bias) in enumerate(layers):
             kept.append(torch.addmm(bias, x, weight.t()))
-            x = activation(kept[-1])
-        if self.memory:
-            h, (weight, bias), own = inputs[-1].squeeze(-2), *layers[-3:-1]
-            read = torch.addmm(bias, x, weight.t())
-            if lasts is None:
-                gates, new, own_new = gates_of(read, h, *own)
-                kept += [gates, new, own_new, recalled_by(gates, new, h)]
-            else:
-                read, h = (y.unflatten(0, lasts.shape[:2]).transpose(0, 1) for y in (read, h))
-                recalled = Recall.apply(read, h[0], lasts.to(read).transpose(0, 1), *own)
-                kept.append(cast(Tensor, recalled).transpose(0, 1).flatten(0, 1))
-            x = torch.cat((x, kept[-1]), 1)
-        weight, bias = layers[-1]
-        return [*kept, torch.addmm(bias, x, weight.t())]
+            if i == len(self.activations):
+                break
+            x = self.activations[i](kept[-1])
+            if self.memory and i == 0:
+                h, (weight, bias), own = inputs[-1].squeeze(-2), *gru
+                read = torch.addmm(bias, x, weight.t())
+                if lasts is None:
+                    gates, new, own_new = gates_of(read, h, *own)
+                    kept += [gates, new, own_new, recalled_by(gates, new, h)]
+                else:
+                    read, h = (y.unflatten(0, lasts.shape[:2]).transpose(0, 1) for y in (read, h))
+                    recalled = Recall.apply(read, h[0], lasts.to(read).transpose(0, 1), *own)
+                    kept.append(cast(Tensor, recalled).transpose(0, 1).flatten(0, 1))
+                x = torch.cat((x, kept[-1]), 1)
+        return kept
 
-    def _after_eyes(self, weights: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
-        """Weight and bias of each layer after the convolutions."""
+    def _after_eyes(self, weights: Sequence[Tensor]) -> tuple[list[Pair], list[Pair]]:
+        """Weight and bias of each layer after the convolutions, and of the two of a memory."""
         own = weights[2 * len(self.lenses) :]
-        return list(zip(own[::2], own[1::2], strict=True))
+        pairs = list(zip(own[::2], own[1::2], strict=True))
+        return ([pairs[0], *pairs[3:]], pairs[1:3]) if self.memory else (pairs, [])
 
     def _see(self, weights: Sequence[Tensor], inputs: Sequence[Tensor]) -> list[Tensor]:
         """What the convolutions return of a depth image (n, channels, height, width) [m], (n, k); nothing if blind."""

@@ -24,7 +24,7 @@ ONNXRegistry.from_torchlib = staticmethod(functools.cache(ONNXRegistry.from_torc
 
 GCC = ["gcc", "-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC"]
 CAMERA = {"width": 6, "height": 5, "pitch": 0.2, "rate": 2, "delay": 1, "noise": 0.02, "dropout": 0.05}
-SIZES = {"num_cells": (7,), "channels": (2, 3)}
+SIZES = {"num_cells": (7, 6), "channels": (2, 3)}
 TASKS = {  # with all that policies may read, spread over the tasks
     "hovering": {},
     "tracking": {"drone": "crazyflie", "curve": "lemniscate", "observe_last_action": True, "action_delay": 2},
@@ -182,7 +182,7 @@ def by_hand(actor, observation, depth=None, memory=None):
     """The mean action and the memory after it, from the weights; torch's own recurrent cell is not TorchRL's."""
     if depth is None and memory is None:
         return torch.tanh(actor[0].module.mlp(observation).chunk(2, 1)[0]), None
-    sight, last = actor[0][0].module, actor[0][-1].module.mlp[-1]
+    sight, head = actor[0][0].module, actor[0][-1].module.mlp
     if depth is None:
         x = nn.functional.elu(sight.trunk.mlp(observation))
     else:
@@ -194,4 +194,4 @@ def by_hand(actor, observation, depth=None, memory=None):
         gru = actor[0][1].gru
         memory = torch.gru_cell(x, memory, gru.weight_ih_l0, gru.weight_hh_l0, gru.bias_ih_l0, gru.bias_hh_l0)
         x = torch.cat((x, memory), 1)
-    return torch.tanh(last(x).chunk(2, 1)[0]), memory
+    return torch.tanh(head(x).chunk(2, 1)[0]), memory

@@ -117,7 +117,7 @@ def check(transform, in_keys=("observation",), *, coarse=False, recurrent=False,
     base = HoveringEnv(num_envs=3, max_episode_steps=5, dtype=torch.float64, **options)
     env = TransformedEnv(base, transform)
     options = {"recurrent": True, "hidden_size": 5, "noise_correlation": 0.4} if recurrent else {}
-    actor = make_actor(env, (8,), in_keys=list(in_keys), return_log_prob=True, **options)
+    actor = make_actor(env, (8, 7), in_keys=list(in_keys), return_log_prob=True, **options)
     if recurrent:
         env = TransformedEnv(base, Compose(transform.clone(), InitTracker(), actor.make_tensordict_primer()))
     expected = fly(env, actor, inside=False)

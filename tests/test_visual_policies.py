@@ -21,7 +21,7 @@ from torchrl_quad.modules import make_actor, make_qvalue, make_value, make_visua
 from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss
 
 CAMERA = {"width": 6, "height": 4}
-SMALL = {"channels": (2,), "num_cells": (5,), "hidden_size": 3}
+SMALL = {"channels": (2,), "num_cells": (5, 4), "hidden_size": 3}
 MEMORY = "recurrent_state"
 MODE = ExplorationType.DETERMINISTIC
 
@@ -101,7 +101,7 @@ def test_a_policy_in_a_compiled_horizon_sees_and_remembers_as_in_an_eager_flight
     monkeypatch.setattr("torchrl_quad.engine.program.Compiled", Direct)
     monkeypatch.setattr("torch.compiler.nested_compile_region", lambda function: function)
     env = forest(max_episode_steps=3, dt=0.01, control_dt=0.01)
-    actor, results = actor_for(env) if sees else make_actor(env, (4,), recurrent=True, hidden_size=5), []
+    actor, results = actor_for(env) if sees else make_actor(env, (4, 6, 5), recurrent=True, hidden_size=5), []
     if way == "called":
         actor[0][0].register_forward_hook(lambda *_: None)
     for _ in range(2):
@@ -151,9 +151,9 @@ def test_an_empty_memory_is_none():
         for x in recurrent[0][1].parameters():
             x.zero_()
         plain[0][0].load_state_dict(recurrent[0][0].state_dict())
-        width = SMALL["num_cells"][-1]
-        plain[0][1].module.mlp[-1].weight.copy_(recurrent[0][2].module.mlp[-1].weight[:, :width])
-        plain[0][1].module.mlp[-1].bias.copy_(recurrent[0][2].module.mlp[-1].bias)
+        layers = recurrent[0][2].module.state_dict()
+        layers["mlp.0.weight"] = layers["mlp.0.weight"][:, : SMALL["num_cells"][0]]
+        plain[0][1].module.load_state_dict(layers)
     flights = [anew(env).rollout(4, actor, break_when_any_done=False) for actor in (recurrent, plain)]
     torch.testing.assert_close(flights[0]["action"], flights[1]["action"])
     assert (flights[0][MEMORY] == 0).all()

@@ -57,8 +57,8 @@ def make_actor(
     Args:
         env: any TorchRL environment, for the sizes of its entries, the action's bounds, device and floating-point type.
         num_cells: the width of every hidden layer, in a list: [64, 64], or [64] for a single layer. A memory reads the
-            first one; the others, or the head, read both. The second layer is what lets a policy change its gains by
-            what it remembers, as for :doc:`any drone <any_drone>`.
+            first one; the second one, or the head, reads both. Two layers let a policy change its gains by what it
+            remembers, as it must to fly any drone.
         in_keys: the entries that are concatenated into the network's input, each (*, k), in a list: ["observation"].
         activation: of the hidden layers; smooth ones give smooth policy gradients.
         input_scale: the input is multiplied by this; a number, or one for each of ``in_keys``. What the tasks observe

@@ -226,3 +226,63 @@ def usd_events(t, slow):
     pulses = np.round(65535 * true["motor_command"]).astype(int)  # m1 is front right, and then clockwise
     columns |= {f"motor.m{k + 1}": ("H", pulses[:, place]) for k, place in enumerate((3, 2, 1, 0))}
     return {"fixedFrequency": (t, columns), "battery": (slow, {"pm.vbat": ("f", battery["battery_voltage"])})}
+
+
+ACTUATORS = "std_msgs/Header header\nfloat64[] angles\nfloat64[] angular_velocities\nfloat64[] normalized\n"
+
+
+def ros_messages(store, stamped, speeds, share):
+    """Topics of a flight in motion capture: poses of the tracker, an IMU, the motors, odometry, and a battery.
+
+    ``stamped`` is the first second of the stamps, None for none; of ``speeds`` each motor has this many [rad/s]."""
+    make = {kind.rpartition("/")[2]: cls for kind, cls in reversed(store.types.items())}
+    extra = {"seq": 0} if "seq" in make["Header"].__dataclass_fields__ else {}
+    zeros, covariance = np.zeros(9), np.zeros(36)
+    for rate, topic, kind in (
+        (100, "pose", "geometry_msgs/msg/PoseStamped"),
+        (50, "odom", "nav_msgs/msg/Odometry"),
+        (125, "imu", "sensor_msgs/msg/Imu"),
+        (100, "motors", "mav_msgs/msg/Actuators"),
+        (5, "battery", "geometry_msgs/msg/Vector3"),  # any message may carry the battery: a mapping names it
+    ):
+        t = times(share * rate)
+        true = flight(t)
+        true["body"] = np.einsum("nji,nj->ni", matrix(true["quaternion"]), true["velocity"])
+        for i, at in enumerate(t):
+            now = {name: x[i] for name, x in true.items()}
+            seconds = (stamped or 0) + (0 if stamped is None else int(at))
+            stamp = make["Time"](seconds, 0 if stamped is None else round(at % 1 * 1e9))
+            header = make["Header"](stamp=stamp, frame_id="world", **extra)
+            pose = make["Pose"](make["Point"](*now["position"]), make["Quaternion"](*np.roll(now["quaternion"], -1)))
+            rates, speed, force = (make["Vector3"](*now[x]) for x in ("angular_velocity", "body", "acceleration"))
+            twist = make["TwistWithCovariance"](make["Twist"](speed, rates), covariance)
+            values = {
+                "pose": (header, pose),
+                "odom": (header, "drone", make["PoseWithCovariance"](pose, covariance), twist),
+                "imu": (header, pose.orientation, zeros, rates, zeros, force, zeros),
+                "motors": (header, zeros[:0], zeros[:0], now["motor_command"])
+                if not len(speeds)
+                else (header, zeros[:0], np.resize(now["motor_command"], len(speeds)) * speeds, zeros[:0]),
+                "battery": (now["battery_voltage"], 0.0, 0.0),
+            }
+            yield topic, kind, int((1_700_000_000 + at) * 1e9), store.types[kind](*values[topic])
+
+
+def write_bag(path, ros2, storage="MCAP", twin=None, stamped=1_700_000_000, speeds=(), share=1.0):
+    """A bag of either version; ``twin`` is a topic that it has twice, and ``share`` that of the usual rates."""
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as Writer2
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE if ros2 else Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(ACTUATORS, "mav_msgs/msg/Actuators"))
+    connections = {}
+    with Writer2(path, version=9, storage_plugin=StoragePlugin[storage]) if ros2 else Writer1(path) as writer:
+        for topic, kind, received, message in ros_messages(store, stamped, np.asarray(speeds), share):
+            raw = store.serialize_cdr(message, kind) if ros2 else bytes(store.serialize_ros1(message, kind))
+            for name in (topic, *([f"{topic}2"] if topic == twin else [])):
+                if name not in connections:
+                    connections[name] = writer.add_connection(f"/drone/{name}", kind, typestore=store)
+                writer.write(connections[name], received, raw)
+    return path

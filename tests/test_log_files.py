@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from log_writers import END, SERVOS, TABLE, ULOG, dataflash_messages, flight, matrix, own_table, px4_messages, times
+from log_writers import END, SERVOS, TABLE, ULOG, dataflash_messages, flight, own_table, px4_messages, times
 
-from log_writers import ulog_message, usd_events, write_csv, write_dataflash, write_ulog, write_usd  # isort: skip
+from log_writers import ulog_message, usd_events, write_bag, write_csv, write_dataflash, write_ulog, write_usd  # isort: skip
 from refusals import refuses
 
 from torchrl_quad.identification import Columns, GapsTooLarge, LogError, MissingColumns, read_log, sources
@@ -79,6 +79,16 @@ def test_a_dataflash_log_of_ardupilot_is_read_in_our_frames(tmp_path):
     data = path.read_bytes()
     path.write_bytes(data[:200_000] + b"\xa3\x95\xff" * 5 + data[200_000:-7])
     assert "the dataflash log is damaged: " in str(read_log(path))
+    path.write_bytes(data + data)
+    log, messages = read_log(path), dataflash_messages()
+    (a, b), (c, d) = log.segments
+    assert "the log holds 2 boots" in str(log) and (c - a) * log.dt == pytest.approx(END + 10.0, abs=0.02)
+    np.testing.assert_allclose(log.position[c + 5 : d - 5], log.position[a + 5 : b - 5], atol=2e-3)
+    t, letters, own = messages["XKF1"]  # one core flies at first, and the other from then on
+    late, core, t = np.repeat(t > 4.0, 2), np.tile([0, 1], len(t)), np.repeat(t, 2)
+    rows = {x: np.repeat(values, 2) * (core == late) for x, values in own.items()} | {"C": core}
+    messages |= {"XKF1": (t, letters, rows), "XKF4": (t, "BB", {"C": core, "PI": late.astype(int)})}
+    same(read_log(write_dataflash(path, messages, SERVOS)), quaternion=4e-3)
     for parameters in ({"FRAME_CLASS": 2}, SERVOS | {"SERVO9_FUNCTION": 37}, {"SERVO1_FUNCTION": 4}, {"Q_ENABLE": 1}):
         six = write_dataflash(path, dataflash_messages(), {k: float(x) for k, x in parameters.items()})
         refuses("drone with (six|5) rotors|is not the log of a quadrotor", read_log, six, error=WrongMotors)
@@ -167,66 +177,6 @@ def test_compressed_states_of_a_crazyflie_are_unpacked(tmp_path):
         read_log(path, {"angular_velocity": ("gyro.x", "gyro.y", "gyro.w")})
 
 
-ACTUATORS = "std_msgs/Header header\nfloat64[] angles\nfloat64[] angular_velocities\nfloat64[] normalized\n"
-
-
-def ros_messages(store, stamped, speeds, share):
-    """Topics of a flight in motion capture: poses of the tracker, an IMU, the motors, odometry, and a battery.
-
-    ``stamped`` is the first second of the stamps, None for none; of ``speeds`` each motor has this many [rad/s]."""
-    make = {kind.rpartition("/")[2]: cls for kind, cls in reversed(store.types.items())}
-    extra = {"seq": 0} if "seq" in make["Header"].__dataclass_fields__ else {}
-    zeros, covariance = np.zeros(9), np.zeros(36)
-    for rate, topic, kind in (
-        (100, "pose", "geometry_msgs/msg/PoseStamped"),
-        (50, "odom", "nav_msgs/msg/Odometry"),
-        (125, "imu", "sensor_msgs/msg/Imu"),
-        (100, "motors", "mav_msgs/msg/Actuators"),
-        (5, "battery", "geometry_msgs/msg/Vector3"),  # any message may carry the battery: a mapping names it
-    ):
-        t = times(share * rate)
-        true = flight(t)
-        true["body"] = np.einsum("nji,nj->ni", matrix(true["quaternion"]), true["velocity"])
-        for i, at in enumerate(t):
-            now = {name: x[i] for name, x in true.items()}
-            seconds = (stamped or 0) + (0 if stamped is None else int(at))
-            stamp = make["Time"](seconds, 0 if stamped is None else round(at % 1 * 1e9))
-            header = make["Header"](stamp=stamp, frame_id="world", **extra)
-            pose = make["Pose"](make["Point"](*now["position"]), make["Quaternion"](*np.roll(now["quaternion"], -1)))
-            rates, speed, force = (make["Vector3"](*now[x]) for x in ("angular_velocity", "body", "acceleration"))
-            twist = make["TwistWithCovariance"](make["Twist"](speed, rates), covariance)
-            values = {
-                "pose": (header, pose),
-                "odom": (header, "drone", make["PoseWithCovariance"](pose, covariance), twist),
-                "imu": (header, pose.orientation, zeros, rates, zeros, force, zeros),
-                "motors": (header, zeros[:0], zeros[:0], now["motor_command"])
-                if not len(speeds)
-                else (header, zeros[:0], np.resize(now["motor_command"], len(speeds)) * speeds, zeros[:0]),
-                "battery": (now["battery_voltage"], 0.0, 0.0),
-            }
-            yield topic, kind, int((1_700_000_000 + at) * 1e9), store.types[kind](*values[topic])
-
-
-def write_bag(path, ros2, storage="MCAP", twin=None, stamped=1_700_000_000, speeds=(), share=1.0):
-    """A bag of either version; ``twin`` is a topic that it has twice, and ``share`` that of the usual rates."""
-    from rosbags.rosbag1 import Writer as Writer1
-    from rosbags.rosbag2 import StoragePlugin
-    from rosbags.rosbag2 import Writer as Writer2
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE if ros2 else Stores.ROS1_NOETIC)
-    store.register(get_types_from_msg(ACTUATORS, "mav_msgs/msg/Actuators"))
-    connections = {}
-    with Writer2(path, version=9, storage_plugin=StoragePlugin[storage]) if ros2 else Writer1(path) as writer:
-        for topic, kind, received, message in ros_messages(store, stamped, np.asarray(speeds), share):
-            raw = store.serialize_cdr(message, kind) if ros2 else bytes(store.serialize_ros1(message, kind))
-            for name in (topic, *([f"{topic}2"] if topic == twin else [])):
-                if name not in connections:
-                    connections[name] = writer.add_connection(f"/drone/{name}", kind, typestore=store)
-                writer.write(connections[name], received, raw)
-    return path
-
-
 def test_bags_of_ros_1_and_2_find_topics_by_their_types(tmp_path, monkeypatch):
     log = read_log(write_bag(tmp_path / "flight.bag", ros2=False), BATTERY)
     same(log)
@@ -248,7 +198,7 @@ def test_bags_of_ros_1_and_2_find_topics_by_their_types(tmp_path, monkeypatch):
         refuses(message, read_log, file, columns, error=MissingColumns)
     with monkeypatch.context() as patch:  # a remedy for the position leaves the attitude of its topic
         true = flight
-        patch.setattr("test_log_files.flight", lambda t: true(t) | {"position": 1e3 * true(t)["position"]})
+        patch.setattr("log_writers.flight", lambda t: true(t) | {"position": 1e3 * true(t)["position"]})
         long = write_bag(tmp_path / "long.bag", ros2=False)
     said = refuses("in millimetres", read_log, long, BATTERY, error=WrongUnit)
     same(read_log(long, **eval(f"dict({said.partition('write ')[2][:-1]})", {"Columns": Columns})), velocity=2e-2)

@@ -350,7 +350,8 @@ _FRAMES = {2: "six", 3: "eight", 4: "eight", 5: "six", 6: "one", 7: "three", 12:
 
 
 def read_dataflash(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
-    """A stream for each message: columns ``NAME.field``, or ``NAME#1.field`` of its second instance or core.
+    """A stream for each message: columns ``NAME.field``, or ``NAME#1.field`` of its second instance or core; of an EKF
+    that says which core is primary, ``NAME.field`` is of that one. Boots follow one another.
 
     ``RCOU.signal`` are the outputs that SERVOn_FUNCTION gives to motors 1 to 4, from MOT_PWM_MIN to MOT_PWM_MAX.
 
@@ -359,6 +360,7 @@ def read_dataflash(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
     """
     kinds: dict[int, tuple[str, str, list[str], np.dtype]] = {}
     starts: dict[int, array] = {}
+    boots, described = list[int](), set[int]()  # where each boot but the first begins; kinds that this one described
     at, lost = data.find(HEAD), 0
     while at >= 0 and at + 3 <= len(data):
         kind = data[at + 2]
@@ -375,32 +377,45 @@ def read_dataflash(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
                 record = np.dtype([(field, _LETTERS[letter]) for field, letter in zip(fields, letters, strict=True)])
                 if record.itemsize + 3 == data[at + 4]:
                     kinds[data[at + 3]] = message, letters, fields, record
+            if data[at + 3] in described:
+                boots, described = [*boots, at], set()
+            described.add(data[at + 3])
         else:
             starts.setdefault(kind, array("Q")).append(at + 3)
         at += size
-    streams, parameters = {}, {}
+    streams, parameters, tables, ends = {}, {}, {}, np.zeros(len(boots) + 1)
     for kind, places in starts.items():
         message, letters, fields, record = kinds[kind]
         rows = pick(data, places, record)
         if message == "PARM" and {"Name", "Value"} <= set(fields):
             names = (x.decode(errors="ignore") for x in rows["Name"])
             parameters |= dict(zip(names, rows["Value"].tolist(), strict=True))
-        if "TimeUS" not in fields:
-            continue
         columns = {
             field: numbers(rows[field]) * _SCALES.get(letter, 1.0)
             for field, letter in zip(fields, letters, strict=True)
             if letter not in "nNZa"
         }
-        which = next((columns[x] for x in ("I", "C", "Inst", "Instance") if x in columns), np.zeros(len(rows)))
-        for k in np.unique(which).astype(int) if message != "RCOU" else [0]:
-            own = which == k
-            stem = f"{message}#{k}" if k else message
+        if "TimeUS" in columns:
+            tables[message] = np.searchsorted(boots, places), columns
+            np.maximum.at(ends, tables[message][0], columns["TimeUS"] + 1e7)
+    for boot, columns in tables.values():  # whose clock begins anew with each boot
+        columns["TimeUS"] += (np.cumsum(ends) - ends)[boot]
+    for message, (_, columns) in tables.items():
+        time = columns["TimeUS"]
+        which = next((columns[x] for x in ("I", "C", "Inst", "Instance") if x in columns), np.zeros(len(time)))
+        some = np.unique(which).astype(int) if message != "RCOU" else [0]
+        parts = {f"{message}#{k}" if k else message: which == k for k in some}
+        _, ekf = tables.get(f"{message[:2]}F4", (0, {}))
+        if "C" in columns and "PI" in ekf:  # which core the autopilot flew by
+            primary = ekf["PI"][np.maximum(np.searchsorted(ekf["TimeUS"], time, "right") - 1, 0)]
+            parts |= {message: which == primary} if (which == primary).any() else {}
+        for stem, own in parts.items():
             values = {f"{stem}.{field}": x[own] for field, x in columns.items()}
-            streams[stem] = Stream(stem, columns["TimeUS"][own] * 1e-6, values)
+            streams[stem] = Stream(stem, time[own] * 1e-6, values)
     if not streams:
         raise UnreadableLog(f"{name} is not a readable dataflash log: it holds no message with a time. Copy it again.")
     notes = [f"the dataflash log is damaged: {lost} bytes were not read"] if lost else []
+    notes += [f"the log holds {len(ends)} boots: they follow one another, 10 s apart"] if boots else []
     if "RCOU" in streams:
         streams["RCOU"] = _with_signals(streams["RCOU"], parameters, name, notes)
     return list(streams.values()), notes

@@ -106,7 +106,8 @@ def test_the_parameters_of_a_ulog_say_which_outputs_are_motors_and_which_drones_
     pulses = np.where(signal > 0.0, 1075.0 + 875.0 * signal, 900.0)
     ours = pulses[:, [0, 3, 2, 1]]  # front left, front right, back right, back left
     outputs = {"output": ("float", np.concatenate((0.0 * ours, ours), 1))}
-    messages |= {"actuator_outputs": (t, {"output": ("float", still)}), "actuator_outputs#1": (t, outputs)}
+    gimbal = still + 400.0 * np.sin(np.outer(t, np.arange(8) % 4))  # whose first axis stands still
+    messages |= {"actuator_outputs": (t, {"output": ("float", gimbal)}), "actuator_outputs#1": (t, outputs)}
     messages["actuator_armed"] = (t, {"armed": ("uint8_t", np.ones(len(t)))})
     limits = {"PWM_MIN": 1075, "PWM_MAX": 1950, "PWM_DISARMED": 900}
     functions = {f"PWM_AUX_FUNC{5 + k}": 101 + k for k in range(4)}

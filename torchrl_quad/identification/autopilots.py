@@ -131,13 +131,10 @@ def _add_signals(streams: dict[str, Stream], parameters: Mapping[str, float]) ->
                 with np.errstate(over="ignore"):
                     signals[f"{stem}.signal[{k}]"] = motor_signal(np.nan_to_num(numbers(control)), curve)
     elif outputs:
-        moves = {
-            x: sum(np.std(np.nan_to_num(streams[x].columns.get(f"{x}.output[{k}]", 0.0))) for k in range(16))
-            for x in outputs
-        }
-        stem = max(outputs, key=lambda x: moves[x])
         ports = {parameters.get(f"PWM_{p}_FUNC{n}"): (p, n) for p in ("AUX", "MAIN") for n in range(16, 0, -1)}
         places = [ports.get(101 + motor, ("MAIN", motor + 1)) for motor in order]
+        of = {x: [streams[x].columns.get(f"{x}.output[{n - 1}]", np.zeros(1)) for _, n in places] for x in outputs}
+        stem = max(outputs, key=lambda x: sorted(np.std(np.nan_to_num(y)) for y in of[x]))  # gimbals do not move four
         all_four = {k: streams[stem].columns.get(f"{stem}.output[{n - 1}]") for k, (_, n) in enumerate(places)}
         pulses = {k: x for k, x in all_four.items() if x is not None}
         reached = np.concatenate([*pulses.values(), np.zeros(1)])

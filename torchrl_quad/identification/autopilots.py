@@ -135,8 +135,7 @@ def _add_signals(streams: dict[str, Stream], parameters: Mapping[str, float]) ->
         places = [ports.get(101 + motor, ("MAIN", motor + 1)) for motor in order]
         of = {x: [streams[x].columns.get(f"{x}.output[{n - 1}]", np.zeros(1)) for _, n in places] for x in outputs}
         stem = max(outputs, key=lambda x: sorted(np.std(np.nan_to_num(y)) for y in of[x]))  # gimbals do not move four
-        all_four = {k: streams[stem].columns.get(f"{stem}.output[{n - 1}]") for k, (_, n) in enumerate(places)}
-        pulses = {k: x for k, x in all_four.items() if x is not None}
+        pulses = {k: x for k, x in enumerate(of[stem]) if len(x) == len(streams[stem].time)}
         reached = np.concatenate([*pulses.values(), np.zeros(1)])
         least, most = float(np.nanmin(reached)), float(np.nanmax(reached))
         begun = float(np.nanmin(reached, where=reached > 0.0, initial=most))

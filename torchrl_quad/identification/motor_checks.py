@@ -14,6 +14,7 @@ from torchrl_quad.identification.pieces import OFF
 from torchrl_quad.identification.signals import Array, Signal, convolved, slope, smooth
 
 LEAST_HOVER = 0.05  # of the full command: a drone of which this is more than hovering lifts itself a hundred times
+_THRUSTS = ". If they are thrusts, put sqrt(thrust / full thrust) into the file instead, and leave battery_voltage out"
 _COMMANDS = (  # factor, offset, least, largest, and what they are
     (0.01, 0.0, 0.0, 101.0, "percents"),
     (1e-3, 1000.0, 700.0, 2600.0, "pulses from 1000 to 2000 us"),
@@ -51,6 +52,7 @@ def check_motors(signal: Signal) -> list[str]:
         remedies.append({"quantity": signal.field, "name": "rotor_speed", "when": "they are rotor speeds in rad/s"})
     like = " or ".join(x["when"].removeprefix("they are ") for x in remedies)
     said = f"may be {like}" if like else "is like neither percents, pulses, DShot, counts nor speeds of rotors"
+    said += _THRUSTS if low >= 0.0 and begun < 700.0 and high < 5000.0 else ""  # gram-force
     raise WrongUnit(
         f"{signal} runs from {low:.4g} to {high:.4g}, and must run from 0 to 1, the full command. It {said}.", *remedies
     )

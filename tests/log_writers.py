@@ -68,7 +68,7 @@ def own_table(t, **changes):
 
 def write_csv(path, columns):
     table = np.stack(list(columns.values()), -1)
-    np.savetxt(path, table, delimiter=",", header=",".join(columns), comments="", fmt="%.9g")
+    np.savetxt(path, table, delimiter=",", header=",".join(columns), comments="", fmt="%.10g")
     return path
 
 

@@ -18,7 +18,7 @@ from log_writers import ulog_message, usd_events, write_bag, write_csv, write_da
 from refusals import refuses
 
 from torchrl_quad.identification import Columns, GapsTooLarge, LogError, MissingColumns, read_log, sources
-from torchrl_quad.identification.autopilots import decompress_quaternions, read_ulog
+from torchrl_quad.identification.autopilots import PACKED, read_ulog, unpacked
 from torchrl_quad.identification.errors import NoFlight, UnreadableLog, WrongMotors, WrongUnit
 
 BATTERY = {"battery_voltage": "/drone/battery.x"}
@@ -159,7 +159,7 @@ def test_compressed_states_of_a_crazyflie_are_unpacked(tmp_path):
     for k in range(4):
         part = (q[:, k] < 0).astype(int) << 9 | np.rint(np.abs(q[:, k]) * 2**0.5 * 511).astype(int)
         code = np.where(largest == k, code, code << 10 | part)
-    back = decompress_quaternions(code)
+    back = np.stack(list(unpacked({PACKED: code}).values()), -1)
     assert (1.0 - np.abs((back * q).sum(-1))).max() < 1e-5
     event = usd_events(t, times(10))["fixedFrequency"][1]
     small = {name: x for name, x in event.items() if name.startswith(("acc", "motor"))}
@@ -168,11 +168,16 @@ def test_compressed_states_of_a_crazyflie_are_unpacked(tmp_path):
         small[f"stateEstimateZ.v{axis}"] = ("h", np.round(1e3 * true["velocity"][:, k]).astype(int))
     for name, x in zip(("Roll", "Pitch", "Yaw"), (true["angular_velocity"] * (1, -1, 1)).T, strict=True):
         small[f"stateEstimateZ.rate{name}"] = ("h", np.round(1e3 * x).astype(int))
-    small["stateEstimateZ.quat"] = ("I", code)
-    log = read_log(write_usd(tmp_path / "log01", {"fixedFrequency": (t, small)}, 2))
-    assert log.battery_voltage is None
-    log = type(log)(**{**vars(log), "battery_voltage": flight(log.time)["battery_voltage"]})
-    same(log, quaternion=4e-3)
+    small[PACKED] = ("I", code)
+    table = {"Timestamp": 1e3 * t + 5e4} | {name: x for name, (_, x) in small.items()}  # as the client writes it
+    for path in (
+        write_usd(tmp_path / "log01", {"fixedFrequency": (t, small)}, 2),
+        write_csv(tmp_path / "a.csv", table),
+    ):
+        log = read_log(path)
+        assert log.battery_voltage is None
+        log = type(log)(**{**vars(log), "battery_voltage": flight(log.time)["battery_voltage"]})
+        same(log, quaternion=4e-3)
     path = write_usd(tmp_path / "log02", usd_events(t, times(10)) | {"second": (t, {"gyro.w": ("f", t)})}, 2)
     with pytest.raises(UnreadableLog, match="different streams"):
         read_log(path, {"angular_velocity": ("gyro.x", "gyro.y", "gyro.w")})

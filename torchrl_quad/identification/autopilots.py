@@ -293,17 +293,20 @@ def read_usd(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
     for kind, record in records.items():
         rows = pick(body, starts[kind], record)
         values = {field: numbers(rows[field]) for field in record.names[2:]}
-        if "stateEstimateZ.quat" in values and rows["stateEstimateZ.quat"].dtype.kind in "iu":
-            q = decompress_quaternions(rows["stateEstimateZ.quat"])
-            values |= {f"stateEstimateZ.q{axis}": q[:, k] for k, axis in enumerate("xyzw")}
-        streams.append(Stream(names[kind], rows["tick"] * unit, values))
+        streams.append(Stream(names[kind], rows["tick"] * unit, values | unpacked(values)))
     return streams, notes
 
 
-def decompress_quaternions(compressed: NDArray[np.integer]) -> Array:
-    """Quaternions (N, 4), x y z w, of ``stateEstimateZ.quat`` (``quatcompress.h``): the top two bits name the largest
-    component, which is positive; the others follow in ten bits each, a sign and a share of sqrt(1/2) of nine bits."""
-    code = np.asarray(compressed).astype(np.uint64) & np.uint64(0xFFFFFFFF)
+PACKED = "stateEstimateZ.quat"
+
+
+def unpacked(columns: Mapping[str, Array]) -> dict[str, Array]:
+    """The columns of the quaternion that a Crazyflie packs into one (``quatcompress.h``): the top two bits name the
+    largest component, which is positive; the others follow in ten bits each, a sign and a share of sqrt(1/2)."""
+    if PACKED not in columns:
+        return {}
+    told = np.abs(columns[PACKED]) < 2**32
+    code = np.where(told, columns[PACKED], 0.0).astype(np.int64).astype(np.uint64) & np.uint64(0xFFFFFFFF)
     largest = (code >> np.uint64(30)).astype(int)
     q = np.zeros((len(code), 4))
     for k in (3, 2, 1, 0):
@@ -312,7 +315,7 @@ def decompress_quaternions(compressed: NDArray[np.integer]) -> Array:
         q[rows, k] = np.where(part >> 9, -1.0, 1.0) * (part & 0x1FF) / 511.0 * 0.5**0.5
         code[rows] >>= np.uint64(10)
     q[np.arange(len(q)), largest] = np.sqrt(np.maximum(1.0 - (q * q).sum(-1), 0.0))
-    return q
+    return {f"stateEstimateZ.q{axis}": np.where(told, q[:, k], np.nan) for k, axis in enumerate("xyzw")}
 
 
 def _text(body: bytes, at: int) -> tuple[str, int]:

@@ -137,6 +137,7 @@ LAYOUTS = {
     )
     for name, said in shipped("layouts.yaml").items()
 }
+LAYOUTS["cfclient"] = replace(LAYOUTS["crazyflie"], time=Columns(("Timestamp",), 1e-3))
 
 
 def choose(columns: Asked, default: Layout | None) -> Layout:
@@ -220,7 +221,7 @@ def gather(layout: Layout, streams: Sequence[Stream], name: str) -> dict[str, Si
 def match(header: Sequence[str], name: str) -> Layout:
     """The preset for the columns of a CSV file."""
     for layout in LAYOUTS.values():
-        if {*layout.time.names, *layout.columns["position"][0].names} <= set(header):
+        if any({*layout.time.names, *place.names} <= set(header) for place in layout.columns["position"]):
             return layout
     if {"gyroADC[0]", "motor[0]"} <= set(header) and not any(x.startswith("navPos") for x in header):
         raise blackbox(name)

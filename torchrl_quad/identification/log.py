@@ -115,10 +115,10 @@ def read_log(
 
     Args:
         path: a file, or the folder of a ROS 2 bag. Its first bytes say of what kind it is.
-        columns: which columns are which quantity: a preset's name ("nanobench", "px4", "ardupilot", "crazyflie"), a
-            :class:`Layout`, or a mapping from quantities to names or :class:`Columns`, in the order of the convention.
-            By default the kind of file and the header decide. A mapping replaces entries of the preset for the file,
-            and None leaves one out; it describes all of a CSV file, if it names position, attitude and motors.
+        columns: which columns are which quantity: the name of a preset in ``LAYOUTS``, a :class:`Layout`, or a mapping
+            from quantities to names or :class:`Columns`, in the order of the convention. By default the kind of file
+            and the header decide. A mapping replaces entries of the preset for the file, and None leaves one out; it
+            describes all of a CSV file, if it names position, attitude and motors.
             ``{"names": [...], "scale": 1e-3}`` is short for Columns.
         convention: the frames and orders of the file, of :mod:`torchrl_quad.deploy.frames`; by default the preset's,
             and for a mapping of a CSV file ours. Its ``xyzw`` and ``motors`` say how quaternions and motors are named.

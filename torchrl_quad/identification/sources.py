@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_quad.errors import shown
-from torchrl_quad.identification.autopilots import HEAD, read_dataflash, read_ulog, read_usd
+from torchrl_quad.identification.autopilots import HEAD, PACKED, read_dataflash, read_ulog, read_usd, unpacked
 from torchrl_quad.identification.bags import MAGIC, read_bag
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog
 from torchrl_quad.identification.layouts import LAYOUTS, NEEDED, Asked, Layout, blackbox, choose, listed, match
@@ -144,7 +144,7 @@ def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
             f"{name} has no column {clock} of the time. There are{listed(header, [clock, 'time', 'stamp'])}. "
             'Name it: columns={"time": ...}.'
         )
-    asked = layout.names | {clock}
+    asked = layout.names | {clock, PACKED}
     repeated = sorted(column for column, count in collections.Counter(header).items() if count > 1 and column in asked)
     if repeated:
         raise UnreadableLog(f"{name} has several columns of one name: {', '.join(repeated)}. Rename them.")
@@ -166,6 +166,7 @@ def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
     table = np.frombuffer(flat).reshape(-1, len(place))
     values = dict.fromkeys(header, np.broadcast_to(np.nan, len(table)))  # the others are never read
     values |= dict(zip(place, table.T, strict=True))
+    values |= unpacked(values)
     time = (values[clock] - np.asarray(layout.time.offset)) * np.asarray(layout.time.scale)
     told = np.isfinite(table).any(1)  # other rows are empty
     if not told.any() or np.isfinite(time[told]).mean() < 0.5:

@@ -17,6 +17,8 @@ TRUE = flight(T)
 ATTITUDE, AVIATION = (Rotation.from_quat(x["quaternion"], scalar_first=True) for x in (TRUE, ned(TRUE)))
 EULER = {name: columns for name, columns in TABLE.items() if name != "quaternion"} | {"euler": ("r", "p", "h")}
 STILL = {name: TRUE[name] * (0.0, 0.0, 1.0) for name in ("position", "velocity")}
+BACKWARD = ATTITUDE * Rotation.from_rotvec((0, 0, np.pi))
+NO_GYRO = {name: columns for name, columns in TABLE.items() if name != "angular_velocity"}
 NO_SPEED = {name: columns for name, columns in TABLE.items() if name != "velocity"}
 
 
@@ -35,6 +37,8 @@ FAULTS = {  # what changes, how it is named, and what the message says
     "tracker turned": (own_table(T, quaternion=turned((0, 0, 0.8))), TABLE,
         "turned by 46 degrees about .0.0, 0.0, 1.0. a"),
     "tracker pitched": (own_table(T, quaternion=turned((0, 0.5, 0))), TABLE, "turned by 29 degrees about .-?0.0, 1.0"),
+    "tracker backward": (own_table(T, quaternion=turned((0, 0, np.pi))), NO_GYRO, "back right on, or x .*f x of"),
+    "backward angles": (own_table(T) | euler(BACKWARD.as_euler("ZYX")[:, ::-1]), EULER, "180 degrees .*backward, wr"),
     "aviation": (own_table(T, **aviation) | euler(np.degrees(AVIATION.as_euler("ZYX")[:, ::-1])), EULER,
         "in degrees and .* yaw counts from north"),
     "x first": (own_table(T) | euler(ATTITUDE.as_euler("XYZ")), EULER, "about the body's x, then y, then z. Give quat"),
@@ -55,13 +59,15 @@ FAULTS = {  # what changes, how it is named, and what the message says
         "names a column twice: u0, u1"),
 }  # fmt: skip
 
+MENDED = ("tracker backward", "backward angles", "aviation", "feet", "half speed", "minutes", "samples")
+
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_what_contradicts_the_rest_of_a_log_is_named_and_what_is_to_be_written_mends_it(fault, tmp_path):
     table, columns, said = FAULTS[fault]
     path = write_csv(tmp_path / "a.csv", table)
     told = re.search(r"rite (columns=.*)\.$", refuses(said, read_log, path, columns, error=LogError))
-    assert (told is not None) == (fault in ("aviation", "feet", "half speed", "minutes", "samples"))
+    assert (told is not None) == (fault in MENDED)
     if told:
         log = read_log(path, **eval(f"dict({told[1]})", {"Columns": Columns}))
         for name in ("position", "velocity", "acceleration"):

@@ -36,6 +36,11 @@ _DOWN: Remedy = {  # the quaternion times (0, 1, 0, 0)
     "factor": (-1.0, 1.0, 1.0, -1.0),
     "when": "the body of the attitude has y right and z down",
 }
+BACKWARD: list[Remedy] = [  # the quaternion times (0, 0, 0, 1), or yaw by half a turn
+    {"quantity": "quaternion", "order": (3, 2, 1, 0), "factor": (-1.0, 1.0, -1.0, 1.0)},
+    {"quantity": "euler", "factor": (-1.0, -1.0, 1.0), "offset": (0.0, 0.0, np.pi)},
+]
+BACKWARD = [{**x, "when": "x of the attitude's body points backward"} for x in BACKWARD]
 _EULER: list[Remedy] = [  # angles as in aviation, beside positions with z up
     {"quantity": "euler", "factor": (1.0, -1.0, -1.0), "when": "the angles are of a body with y right and z down"},
 ]
@@ -198,7 +203,8 @@ def check_rates(
     if turned > max(0.8, fits[best][0] + SURE):
         raise WrongFrame(
             f"{told} by {turned:.2f} if the body of the attitude is {apart}. Bring all of the log into one body: x "
-            "forward, y left, z up."
+            "forward, y left, z up.",
+            *(BACKWARD if turn[0, 0] < -0.9 < 0.9 < turn[2, 2] else []),
         )
     if fits[best][0] > max(0.5, fit + SURE):
         told += f" by {fits[best][0]:.2f}"
@@ -210,7 +216,7 @@ def check_rates(
         if best == "in the world frame":
             also = f", or the body of the attitude {apart}" if turned > fits[best][0] - SURE else ""
             drop = {"quantity": signal.field, "drop": True}
-            raise WrongFrame(f"{told} if the gyro is in the world frame{also}.", drop)
+            raise WrongFrame(f"{told} if the gyro is in the world frame{also}.", *(BACKWARD if also else []), drop)
         flip = {"quantity": signal.field, "factor": tuple(signs[best])}
         raise WrongFrame(f"{told} {best}.", *([_NED, *_EULER] if signs[best] is FRD else []), flip)
     said = f"{signal} is {factor:.3g} times the derivative of {given}: it is in"

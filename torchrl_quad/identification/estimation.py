@@ -190,8 +190,8 @@ def _check_turning(prior: QuadrotorParams, logs: Sequence[FlightLog]) -> None:
     if fits[:2].min() < -_CONTRARY:
         raise UserValueError(
             f"identify: motors turn these flights against where the drone's rotor_positions are (correlations "
-            f"{fits[0]:.2f} in roll, {fits[1]:.2f} in pitch). Name the motors of the log front left, back left, back "
-            "right, front right, when it is read."
+            f"{fits[0]:.2f} in roll, {fits[1]:.2f} in pitch). When you read the log, name its motors front left, back "
+            "left, back right, front right, and give the attitude of a body whose x points forward."
         )
 
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torchrl_quad.identification.checks import MAX_LAG
+from torchrl_quad.identification.checks import BACKWARD, MAX_LAG
 from torchrl_quad.identification.errors import WrongMotors, WrongUnit
 from torchrl_quad.identification.pieces import OFF
 from torchrl_quad.identification.signals import Array, Signal, convolved, slope, smooth
@@ -114,10 +114,13 @@ def check_order(
             late = 1000.0 * dt * shifts[int(apart[:, 0].argmax())]
             when = f"{abs(late):.0f} ms {'late' if late > 0.0 else 'early'}"
             return f"the order of the motors fits how the drone turns if its rates are {when}"
+        back = _ORDERS[best] == (2, 3, 0, 1) and "angular_velocity" not in signals
+        said = ". Motors are named from the back right on, or x of the attitude's body points backward"
         raise WrongMotors(
             f"{signal} explain how the drone turns less in the order front left, back left, back right, front right "
             f"(correlations about roll, pitch and yaw add up to {worth[0, 0]:.2f}) than in another "
-            f"({worth[0, best]:.2f}).",
+            f"({worth[0, best]:.2f}){said if back else ''}.",
+            *(BACKWARD if back else []),
             {"quantity": signal.field, "order": _ORDERS[best]},
         )
     others = float(np.delete(worth[0], 0).max())

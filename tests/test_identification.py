@@ -250,6 +250,8 @@ def test_what_contradicts_the_drone_is_found_and_no_inertia_is_one_that_no_body_
     refuses(turned, identify, short, "crazyflie", {"rotor_spin": [-1, 1, -1, 1]}, **QUICK)
     heavy = r"left over .*mass of 0.06 kg or its thrust.*name \"thrust_map\" in fields"
     refuses(heavy, identify, short, "crazyflie", {"mass": 0.06}, iterations=1, **QUICK)
+    plain = dataclasses.replace(load_drone("crazyflie"), motor_command=None)
+    assert "mass: it cannot be judged" in identify(short, plain, {"mass": 0.06}, iterations=1, **QUICK).verdict
     large = dataclasses.replace(short, battery_voltage=10.0 * real.battery_voltage)
     refuses("a battery has 3.* V in the mean, and the drone's motor_command is for", identify, large, **QUICK)
     result = identify(short, iterations=1, **QUICK)

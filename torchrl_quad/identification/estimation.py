@@ -38,6 +38,7 @@ _EVERY_BLOCK = 5  # of which the last is held out
 _TENSORS = ("x", "streams")  # of a state
 _CONTRARY = 0.15  # correlation
 _MOST_TRIM = 0.2  # of the weight
+_UNJUDGED = "it cannot be judged, as the drone has no motor_command whose thrust could contradict it: weigh it"
 _MASS = "without a known mass, motion only tells its ratio to the mass, which `ratios` gives"
 
 
@@ -89,6 +90,7 @@ def identify(
     delay = given.pop("command_delay", None)
     prior = prediction.as_params(prediction.as_params(drone).replace(**given))
     _check_turning(prior, logs)
+    unjudged = {"mass": _UNJUDGED} if prior.motor_command is None and "mass" in given else {}
     prior, motors = _with_motors(prior, logs, delay)
     unknowns = unknowns_of(fields)
     not_fitted = {x for name in known or () for x in FIELDS.get(name, ())} | {"stream"}  # which each log has
@@ -141,7 +143,7 @@ def identify(
         bootstrap=resampled,
         names=list(state.free),
         correlation=_correlation(cover[:n, :n]).tolist(),
-        not_identifiable=_not_identifiable(dropped, has_mass, fields),
+        not_identifiable=_not_identifiable(dropped, has_mass, fields) | unjudged,
         time_constants=two,
         errors=errors,
         errors_by_flight=by_flight,

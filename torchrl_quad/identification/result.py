@@ -79,6 +79,7 @@ class IdentificationResult:
         said = thrust if not 0.8 < found / before < 1.2 else ""
         left = self.trim.get("force_per_weight", (0.0, 0.0, 0.0))[2]
         said += f"; {left:+.0%} of the weight is left over along z: weigh it" if abs(left) > 0.1 else ""
+        said += f"; mass: {self.not_identifiable['mass']}" if self.has_mass and "mass" in self.not_identifiable else ""
         return f"after {horizon:g} s the fit predicts {fit}{said}"
 
     def __str__(self) -> str:

@@ -377,7 +377,8 @@ def read_dataflash(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
                 if record.itemsize + 3 == data[at + 4]:
                     kinds[data[at + 3]] = message, letters, fields, record
             if data[at + 3] in described:
-                boots, described = [*boots, at], set()
+                boots.append(at)
+                described = set()
             described.add(data[at + 3])
         else:
             starts.setdefault(kind, array("Q")).append(at + 3)
@@ -414,7 +415,8 @@ def read_dataflash(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
     if not streams:
         raise UnreadableLog(f"{name} is not a readable dataflash log: it holds no message with a time. Copy it again.")
     notes = [f"the dataflash log is damaged: {lost} bytes were not read"] if lost else []
-    notes += [f"the log holds {len(ends)} boots: they follow one another, 10 s apart"] if boots else []
+    flown = np.count_nonzero(ends)
+    notes += [f"the log holds {flown} boots: they follow one another, 10 s apart"] if flown > 1 else []
     if "RCOU" in streams:
         streams["RCOU"] = _with_signals(streams["RCOU"], parameters, name, notes)
     return list(streams.values()), notes

@@ -100,12 +100,19 @@ MJCF = f"""<mujoco><size memory='9000G'/>
 <default><geom material='m'/><general ctrllimited='true' ctrlrange='0 3'/></default>
 <asset><mesh file='gone.obj' name='a'/><texture name='t' type='2d' file='gone.png'/><material name='m' texture='t'/>
 <hfield name='h' nrow='9' ncol='9' size='1 1 1 1'/></asset>
-<worldbody><geom type='hfield' hfield='h'/>
+<worldbody><geom type='hfield' hfield='h'/><body name='gate'><geom type='mesh' mesh='a'/></body>
+<body><freejoint/><geom type='mesh' mesh='a'/></body>
 <body name='x' euler='0 0 90' pos='0 0 3'><freejoint/><inertial pos='0 0 0' mass='1' diaginertia='0.01 0.02 0.025'/>
 <geom type='mesh' mesh='a' mass='0'/>{TURNED}</body>
 <body name='load'><freejoint/><geom size='0.1' mass='0.1'/><site name='hook'/></body></worldbody>
 <tendon><spatial material='m'><site site='s0'/><site site='hook'/></spatial></tendon>
 <actuator>{PUSHED}<motor site='hook' gear='0 0 0 1 0 0'/></actuator></mujoco>"""
+PAIRED = re.sub(r"(site='s.' gear='0 0 2 0 0) (-?)0.04'", r"\1 0'", MJCF).replace("</actuator>", "{}</actuator>")
+TURNERS = "".join(f"<motor site='s{i}' gear='0 0 0 0 0 {x}' ctrlrange='0 0.12'/>" for i, x in enumerate((-1, -1, 1, 1)))
+ARM = "<body name='arm' pos='0.2 0 0'><geom size='0.1' mass='0.25'/><site name='s'/></body>"
+PUSH = "<actuator><motor site='s' gear='0 0 1 0 0 0.02' ctrlrange='1.5 6'/></actuator></mujoco>"
+REPEATED = "<mujoco><worldbody><body><geom size='0.1' mass='1'/><replicate count='4' euler='0 0 90'>" + ARM
+REPEATED += "</replicate></body></worldbody>" + PUSH
 BIASED = MJCF.replace("ctrlrange='0 3'", "ctrlrange='-1 1' gainprm='1.5' biastype='affine' biasprm='1.5'")
 HELD_FORCE = MJCF.replace("ctrlrange='0 3'", "ctrlrange='0 30' forcelimited='true' forcerange='0 3'")
 PULLED = MJCF.replace("ctrlrange='0 3'", "ctrlrange='-3 0'").replace("gear='0 0 2", "gear='0 0 -2")
@@ -161,6 +168,11 @@ HOVER, FAST = np.sqrt(9.81 * 2 / 4 / 1e-5), 2 * np.pi / 60  # of a rotor of the 
      "thrust_map": [6e-6, 0, 0], "motor_time_constant": 0.05}),
     *(("x.xml", text, {"thrust_map": [6e-6, 0, 0], "linear_drag": [0.1] * 3}, {"rotor_speed_max": 1000, "mass": 2})
       for text in (BIASED, HELD_FORCE, STOOD)),
+    ("x.xml", PAIRED.format(TURNERS), {"rotor_speed_max": 1000, "linear_drag": [0.1] * 3}, {"thrust_map": [6e-6, 0, 0],
+     "rotor_spin": [-1, -1, 1, 1], "yaw_torque_coefficient": 0.02}),
+    ("x.xml", REPEATED, REST | {"rotor_speed_max": 1000, "rotor_spin": [1, -1, 1, -1]}, {"mass": 2,
+     "rotor_positions": [(0.2, 0), (0, 0.2), (-0.2, 0), (0, -0.2)], "thrust_map": [6e-6, 0, 0],
+     "rotor_speed_min": 500}),
     ("x.xml", PULLED, {"rotor_speed_max": 1000, "linear_drag": [0.1] * 3}, {"thrust_map": [6e-6, 0, 0],
      "rotor_spin": [1, 1, -1, -1]}),
     ("x.xml", BY_GEOMS, {"rotor_speed_max": 1000, "linear_drag": [0.1] * 3}, {"mass": 1.9}),
@@ -220,11 +232,13 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_given(
     ("x.xml", MJCF.replace("name='spin0'", "name='k' pos='1 0 0'"), "the joint 'k' turns rotors, and rotors"),
     ("x.xml", MJCF.replace("0 0 2 0 0", "0 0 2 1 0"), "the gear of a rotor turns across its thrust"),
     ("x.xml", MJCF.replace("0 0 2 0 0", "2 0 0 0 0"), "its rotors do not push along the body's z axis"),
-    ("x.xml", MJCF.replace("</default>", "</default><replicate/>"), "a drone needs no such <replicate>"),
+    ("x.xml", PAIRED.format(TURNERS.replace("'0 0.12'", "'-0.12 0.12'")), "rotor_spin .*, or one that may turn either"),
+    ("x.xml", REPEATED.replace("'4'", "'1001'"), "too many parts, copies included. Leave one drone in it"),
+    ("x.xml", MJCF.replace("</default>", "</default><plugin/>"), "a drone needs no such <plugin>"),
     ("x.xml", MJCF.replace("memory=", "nkey='300000' memory="), "a drone needs no such <size>"),
     ("x.xml", MJCF.replace("nrow='9'", "nrow='90000'"), "a drone needs no such <hfield>"),
-    ("x.xml", MJCF.replace("</asset>", "<model name='d' file='x.xml'/></asset>"), "a drone needs no such <model>"),
-    ("x.xml", MJCF.replace("</asset>", "</asset>{#<replicate/>#}"), "MuJoCo reads UTF-8, and no comments of Jinja"),
+    ("x.xml", MJCF.replace("</asset>", "<model name='d' file='x.xml'/></asset>"), "'x.xml', which is included twice"),
+    ("x.xml", MJCF.replace("</asset>", "</asset>{#<plugin/>#}"), "MuJoCo reads UTF-8, and no comments of Jinja"),
     ("x.xml", MJCF.replace("ctrlrange='0 3'", "ctrlrange='0 nan'"), "some of its numbers are nan"),
     ("x.XML", MJCF, "names end in .xml. Rename it"),
     ("x.xml", "<mujoco><include file='x.xml'/></mujoco>", "includes 'x.xml', which is included twice"),
@@ -296,6 +310,12 @@ def test_parts_of_a_model_stand_where_its_simulator_puts_them(tmp_path, monkeypa
         height = 2 * 1 / 3 * (0.2 + 0.05) ** 2  # of the other 2 kg, whose centre is 5 cm above the body
         np.testing.assert_allclose(drone.inertia, [0.035 + height, 0.085 + height, 0.1], atol=1e-6, err_msg=way)
         assert drone.rotor_direction is None
+    (tmp_path / "frame/arm.xml").write_text(f"<mujoco><worldbody>{ARM}</worldbody>{PUSH}")
+    stars = "".join(f"<frame euler='0 0 {90 * i}'><attach model='a' body='arm' prefix='{i}'/></frame>" for i in range(4))
+    whole = "<asset><model name='a' file='frame/arm.xml'/></asset><worldbody><body><geom size='0.1' mass='1'/>" + stars
+    (tmp_path / "x.xml").write_text(f"<mujoco>{whole}</body></worldbody></mujoco>")
+    drone = load_drone(tmp_path / "x.xml", **REST, rotor_speed_max=1000, rotor_spin=[1, -1, 1, -1])
+    np.testing.assert_allclose(drone.rotor_positions, PLUS["rotor_positions"], atol=1e-6)
     monkeypatch.chdir(tmp_path / "2")
     assert load_drone("MODEL.SDF", **given).mass.item() == 3.0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 from collections.abc import Sequence
@@ -14,15 +15,16 @@ from torchrl_quad.dynamics.import_formats import Array, Found, same, speed_at
 from torchrl_quad.dynamics.import_models import Links, one_body, read_tree
 from torchrl_quad.errors import UserValueError, needing, one_line, shown
 
-MANY = ("replicate", "composite", "flexcomp", "plugin", "attach", "model")  # elements that make much of little text
-MOST = 2000  # bodies, and what a file may ask memory for
+MANY = ("composite", "flexcomp", "plugin")  # elements that make much of little text
+MOST = 2000  # bodies, copies included, and what a file may ask memory for
 ACROSS = 0.02  # the share of a torque that may be across the thrust; and how far from a rotor its joint may be [m]
 
 
 def read_mjcf(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
     """What the bodies and actuators of MuJoCo's own format say, which MuJoCo itself reads.
 
-    A rotor is an actuator that pushes at a site. Its gear says where to, and how much it turns the drone.
+    A rotor is an actuator that pushes at a site. Its gear says where to, and how much it turns the drone; or another
+    actuator at its site turns the drone.
     """
     _check_files(path)
     mujoco, model = _compiled(path)
@@ -32,7 +34,15 @@ def read_mjcf(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
     some = [i for i in at_sites if model.actuator_gear[i, :3].any()]
     some = some if len(some) > 3 else []  # fewer push the whole drone
     gear, sites = model.actuator_gear[some], model.actuator_trnid[some, 0]
-    forces = np.array([_greatest(mujoco, model, i) for i in some])
+    ends = np.array([_ends(mujoco, model, i) for i in some]).reshape(-1, 2)
+    forces, turners = np.where(ends[:, 1] >= -ends[:, 0], ends[:, 1], ends[:, 0]), list[int]()
+    for i in (i for i in at_sites if i not in some):
+        low, high = _ends(mujoco, model, i)
+        mine = [k for k in np.flatnonzero(sites == model.actuator_trnid[i, 0]) if forces[k]]
+        if len(mine) == 1 and low * high == 0.0 != low + high:  # else it may turn either way
+            share = (low + high) / forces[mine[0]] * np.linalg.norm(gear[mine[0], :3])
+            gear[mine[0], 3:] += share * model.actuator_gear[i, 3:]
+            turners.append(i)
     bodies = [*model.site_bodyid[sites]] or [1 + model.body_mass[1:].argmax()]
     chains = [_chain(model, x) for x in bodies]
     if len({chain[-1] for chain in chains}) > 1:
@@ -77,27 +87,29 @@ def read_mjcf(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
     unread = [f"the body {model.body(x).name or x}, which moves by itself" for x in others if x not in shared]
     unread += ["drag of MuJoCo's air (density, viscosity)"] if model.opt.density or model.opt.viscosity else []
     unread += ["drag of joints (damping)"] if model.dof_damping.any() else []
-    unread += [f"the actuator {model.actuator(i).name or i}, which is no rotor" for i in at_sites if i not in some]
+    left = [i for i in at_sites if i not in (*some, *turners)]
+    unread += [f"the actuator {model.actuator(i).name or i}, which is no rotor" for i in left]
     if rotors:
         turning = (gear[:, :3] * gear[:, 3:]).sum(1) / np.square(gear[:, :3]).sum(1)
         rest = gear[:, 3:] - turning[:, None] * gear[:, :3]
         if (np.linalg.norm(rest, axis=1) > ACROSS * np.linalg.norm(gear[:, :3], axis=1)).any():
             raise UserValueError(f"{path}: the gear of a rotor turns across its thrust. Say by its site where it is.")
-        found |= _of_motors(mujoco, model, some, forces, turning, given)
+        found |= _of_motors(mujoco, model, some, ends, turning, given)
     else:
         found["rotor_positions"] = None, "no actuators push at sites, one for each rotor"
     return str(path), "MJCF of MuJoCo", found | given, unread
 
 
-def _of_motors(mujoco: Any, model: Any, some: Sequence[int], forces: Array, turning: Array, given: Found) -> Found:
-    """What the actuators of rotors say of motors: their greatest forces [N], and torque per force [m]."""
-    found: Found = {"rotor_spin": (None, "the gear of its actuators has no torque")}
+def _of_motors(mujoco: Any, model: Any, some: Sequence[int], ends: Array, turning: Array, given: Found) -> Found:
+    """What the actuators of rotors say of motors: the ends of their forces [N], and torque per force [m]."""
+    found: Found = {"rotor_spin": (None, "its actuators have no torque, or one that may turn either way")}
     if turning.all():
         found = {"rotor_spin": (np.sign(turning), "gear"), "yaw_torque_coefficient": same(abs(turning), "gear")}
     lags, times = (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT), model.actuator_dynprm[some, 0]
     if all(mujoco.mjtDyn(x) in lags for x in model.actuator_dyntype[some]) and times.all():
         found["motor_time_constant"] = same(times, "their time constants")
-    most, why = same(abs(forces), "their greatest forces")
+    most, why = same(abs(ends).max(1), "their greatest forces")
+    least = abs(ends).min() if (ends.prod(1) > 0.0).all() else 0.0  # of rotors that never stand
     speed, curve = (given.get(x, (None,))[0] for x in ("rotor_speed_max", "thrust_map"))
     if most is None or not most > 0.0:
         found["thrust_map"] = None, why or "no range bounds the force of its actuators"
@@ -105,13 +117,16 @@ def _of_motors(mujoco: Any, model: Any, some: Sequence[int], forces: Array, turn
         found["rotor_speed_max"] = speed_at(most, curve), f"at {most:.4g} N, the most of its actuators"
     elif speed is not None:
         found["thrust_map"] = [most / speed**2, 0.0, 0.0], f"{most:.4g} N of its actuators at rotor_speed_max"
+        curve = found["thrust_map"][0]
     else:
         found["thrust_map"] = None, f"it follows from {most:.4g} N, the most of its actuators, and rotor_speed_max"
+    if least and curve is not None:
+        found["rotor_speed_min"] = speed_at(least, curve), f"at {least:.4g} N, the least of its actuators"
     return found
 
 
-def _greatest(mujoco: Any, model: Any, i: int) -> float:
-    """The force [N] of an actuator at the end of its range where it is greatest, with its sign; 0 without bounds."""
+def _ends(mujoco: Any, model: Any, i: int) -> Array:
+    """The least and the greatest force [N] of an actuator, or torque per length of its gear; zeros without bounds."""
     ends, held = model.actuator_ctrlrange[i], bool(model.actuator_ctrllimited[i])
     plain = (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
     if mujoco.mjtDyn(model.actuator_dyntype[i]) not in plain:
@@ -122,8 +137,8 @@ def _greatest(mujoco: Any, model: Any, i: int) -> float:
     force = gain[0] * ends + (bias[0] if affine else 0.0) if held and of_input else np.array([-np.inf, np.inf])
     if model.actuator_forcelimited[i]:
         force = force.clip(*model.actuator_forcerange[i])
-    end = force[np.abs(force).argmax()]
-    return float(end * np.linalg.norm(model.actuator_gear[i, :3])) if np.isfinite(end) else 0.0
+    force = np.sort(force) * (np.linalg.norm(model.actuator_gear[i, :3]) or 1.0)
+    return force if np.isfinite(force).all() else np.zeros(2)
 
 
 def _chain(model: Any, body: int) -> list[int]:
@@ -142,10 +157,17 @@ def _compiled(path: Path) -> tuple[Any, Any]:
         with warnings.catch_warnings(action="ignore"):
             spec = mujoco.MjSpec.from_file(str(path))
             spec.memory, spec.compiler.fusestatic = -1, False
-            around, by_geoms = spec.worldbody.geoms, spec.compiler.inertiafromgeom == 1
+            at = {x.target for x in spec.actuators if x.trntype == mujoco.mjtTrn.mjTRN_SITE}
+            roots = spec.worldbody.bodies
+            flown = [x for x in roots if any(site.name in at for site in x.find_all("site"))]
+            flown = flown or [x for x in roots if x.find_all("joint")] or roots
+            around = [x for root in roots if root not in flown for x in (root, *root.find_all("body"))]
+            for x in around:
+                x.mass, x.inertia, x.explicitinertial = 1e-6, (1e-6,) * 3, True  # other parts need not be there
             for geom in spec.geoms:
-                is_picture = geom.mass == 0.0 or (np.isnan(geom.mass) and geom.density == 0.0) or geom in around
-                if is_picture or (geom.parent.explicitinertial and not by_geoms):
+                is_picture = geom.mass == 0.0 or (np.isnan(geom.mass) and geom.density == 0.0)
+                is_picture = is_picture or geom.parent in (spec.worldbody, *around)
+                if is_picture or (geom.parent.explicitinertial and geom.parent.compiler.inertiafromgeom != 1):
                     spec.delete(geom)  # whose files need not be there
             for x in (*spec.geoms, *spec.sites):
                 x.material = ""
@@ -165,28 +187,34 @@ def _check_files(path: Path) -> None:
     """Refuse files that MuJoCo reads otherwise than we do, or that make much of little text; included ones, too."""
     if path.suffix != ".xml":
         raise UserValueError(f"{path}: MuJoCo reads files whose names end in .xml. Rename it.")
-    todo, seen, bodies, folders = [path], list[Path](), 0, {path.parent}
+    todo, seen, bodies, parts, copies, folders = [(path, path.parent)], [path], 0, 0, 1, set[Path]()
     while todo:
-        file = todo.pop()
+        file, home = todo.pop()  # home is the folder of the whole model that includes it
         tree, text = read_tree(file), file.read_bytes().decode("utf-8", "replace")
         if "�" in text or "\0" in text or "{#" in text:
             raise UserValueError(f"{file}: MuJoCo reads UTF-8, and no comments of Jinja. Save it so.")
         if re.search(r'[\s"\']nan[\s"\']', text, re.IGNORECASE):
             raise UserValueError(f"{file}: some of its numbers are nan. Write them.")
-        bodies += sum(x.tag == "body" for x in tree.iter())
-        folders |= {path.parent / x.get(k, "") for x in tree.iter("compiler") for k in ("meshdir", "assetdir")}
+        counts = [x.get("count", "").strip() for x in tree.iter("replicate")]
+        copies *= math.prod(min(int(x), MOST) if re.fullmatch(r"\d{1,9}", x) else MOST for x in counts)
+        copies *= max(1, sum(x.tag == "attach" for x in tree.iter()))
+        bodies, parts = bodies + sum(x.tag == "body" for x in tree.iter()), parts + sum(1 for _ in tree.iter())
+        if copies * bodies > MOST or copies * parts > 20 * MOST:
+            raise UserValueError(f"{file}: too many parts, copies included. Leave one drone in it, of {MOST} bodies.")
+        folders |= {home, *(home / x.get(k, "") for x in tree.iter("compiler") for k in ("meshdir", "assetdir"))}
         for x in tree.iter():
             sizes = [y for k, y in x.attrib.items() if x.tag == "size" and k != "memory"]
             asks = any(int(y) > MOST for y in [*sizes, x.get("nrow", ""), x.get("ncol", "")] if re.fullmatch(r"\d+", y))
-            if x.tag in MANY or asks or bodies > MOST or (x.tag == "mesh" and "builtin" in x.attrib):
+            if x.tag in MANY or asks or (x.tag == "mesh" and "builtin" in x.attrib):
                 raise UserValueError(f"{file}: a drone needs no such <{x.tag}>. Take it out, or write its parts out.")
             places = [folder / x.get("file", "") for folder in folders if x.tag == "mesh" and x.get("file")]
             if any(place.exists() and not place.is_file() for place in places):
                 raise UserValueError(f"{file}: the mesh {shown(x.get('file'))} is no file.")
-        for name in (x.get("file", "") for x in tree.iter("include")):
-            inner = next((x for x in (file.parent / name, path.parent / name) if x.is_file()), None)
-            if inner is None or inner in (*seen, *todo, file):
-                why = "is not there" if inner is None else "is included twice"
+        for x in (x for x in tree.iter() if x.tag in ("include", "model")):
+            name, is_model = x.get("file", ""), x.tag == "model"
+            inner = next((x for x in (home / name, file.parent / name) if x.is_file()), None)
+            if inner is None or inner in seen:
+                why = "is not there" if inner is None else "is included twice. Name each file once"
                 raise UserValueError(f"{file} includes {shown(name)}, which {why}.")
-            todo.append(inner)
-        seen.append(file)
+            todo.append((inner, inner.parent if is_model else home))
+            seen.append(inner)

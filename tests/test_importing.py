@@ -79,7 +79,7 @@ FLIGHTMARE += "quadrotor_dynamics: {mass: 0.73, arm_l: 0.17, thrust_map: [1.3e-6
 ROTORS = {"mass": 0.7, "inertia": {"xx": 0.007, "xy": 0, "xz": 0, "yy": 0.008, "yz": 0, "zz": 0.012}}
 OMNI = {"rotor_angles": [0, np.pi / 2, np.pi, -np.pi / 2], "arm_lengths": [0.2] * 4, "directions": [-1, 1, -1, 1]}
 OMNI |= {"force_constants": [8e-6] * 4, "moment_constants": [1.28e-7] * 4, "max_rotation_velocities": [838] * 4}
-OMNI = ROTORS | {"drag_coef": 0.2, "rotor_configuration": OMNI | {"num_rotors": 4}}
+OMNI = ROTORS | {"drag_coef": 0.2, "rotor_configuration": OMNI | {"num_rotors": 4, "tau": 0.4}}
 ROTOR = {"arm_length": 0.2, "rotor_force_constant": 8e-6, "rotor_moment_constant": 0.016}
 ROTORS["rotor_configuration"] = {
     str(k): ROTOR | {"angle": (np.pi / 2) * k, "direction": -((-1) ** k)} for k in (0, 2, 1, 3)
@@ -159,10 +159,13 @@ HOVER, FAST = np.sqrt(9.81 * 2 / 4 / 1e-5), 2 * np.pi / 60  # of a rotor of the 
      "mass", "inertia", "rotor_spin", "thrust_map", "linear_drag", "quadratic_drag")}),
     ("x.json", json.dumps({"dynamics": {**L2F, "rotor_thrust_coefficients": [0.1, 0.5, 5.0]}}),
      {"linear_drag": [0.1] * 3}, {"thrust_map": [5e-6, 5e-4, 0.1]}),
-    ("x.yaml", json.dumps(OMNI), REST, PLUS | {"rotor_speed_max": 838}),
+    ("x.yaml", json.dumps(OMNI), REST, PLUS | {"rotor_speed_max": 838,
+     "unread": "Not read: drag_coef, tau of rotor_configuration"}),
     ("x.yaml", json.dumps(ROTORS), REST | {"rotor_speed_max": 838}, PLUS | {"mass": 0.7}),
     ("x.toml", CRAZYFLOW, {}, {"linear_drag": [0.02, 0.02, 0.03], "motor_time_constant": [
      1 / (10 + 2e-4 * HOVER_RPM), 1 / (4e-4 * HOVER_RPM)]}),
+    ("x.json", json.dumps(ROTORPY | {"c_Dz": None}), {}, {"quadratic_drag": [0, 0, 0],
+     "unread": "Not read: c_Dx, c_Dy, c_Dz"}),
     ("x.xml", MJCF, {"rotor_speed_max": 1000, "linear_drag": [0.1] * 3}, {"mass": 2, "rotor_positions": CORNERS,
      "inertia": [0.029, 0.069, 0.079], "rotor_spin": [-1, -1, 1, 1], "yaw_torque_coefficient": 0.02,
      "thrust_map": [6e-6, 0, 0], "motor_time_constant": 0.05}),
@@ -178,7 +181,7 @@ HOVER, FAST = np.sqrt(9.81 * 2 / 4 / 1e-5), 2 * np.pi / 60  # of a rotor of the 
     ("x.xml", BY_GEOMS, {"rotor_speed_max": 1000, "linear_drag": [0.1] * 3}, {"mass": 1.9}),
 )  # fmt: skip
 def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_given(file, text, given, wanted, tmp_path):
-    path = tmp_path / file
+    path, unread, wanted = tmp_path / file, wanted.get("unread", ""), {k: x for k, x in wanted.items() if k != "unread"}
     path.write_text(text)
     drone = load_drone(path, torch.float64, **given)
     for name, value in wanted.items():
@@ -190,6 +193,7 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_given(
     page = written.read_text()
     assert page.startswith(f"# Source: {file}") and "chosen here: suggest_gains" in page
     assert all(f"{x}: " in page and "given, not in the file" in page for x in given if x != "entry")
+    assert unread in page
     assert ("without a mass: rotor_0, " in page) == ("rotor_0" in text and ">0.25<" not in text)
     assert HoveringEnv(num_envs=1, drone=str(written)).nominal.mass.item() == pytest.approx(drone.mass.item())
 
@@ -248,6 +252,8 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_given(
     ("x.json", "[1]", "this file is of no kind that is known. These can be read"),
     ("x.json", json.dumps({"dynamics": {**L2F, "rotor_positions": [1, 2]}}),
         r"'rotor_positions' has shape \(2,\); it must be"),
+    ("x.toml", CRAZYFLOW.replace("[-1, 1, -1, 1]]", "[-2, 2, -2, 2]]"),
+        "third row of mixing_matrix is .* Write the rest"),
     ("x.toml", TOML, r"choose one drone of the file, by entry='a' or another of"),
     ("x.xacro", "", "a .xacro file has to be run before its numbers can be read. Expand it first"),
     ("x.toml", "[cf2x]\nacc_coef = 1", "this file is of no kind that is known. These can be read"),
@@ -311,9 +317,9 @@ def test_parts_of_a_model_stand_where_its_simulator_puts_them(tmp_path, monkeypa
         np.testing.assert_allclose(drone.inertia, [0.035 + height, 0.085 + height, 0.1], atol=1e-6, err_msg=way)
         assert drone.rotor_direction is None
     (tmp_path / "frame/arm.xml").write_text(f"<mujoco><worldbody>{ARM}</worldbody>{PUSH}")
-    stars = "".join(f"<frame euler='0 0 {90 * i}'><attach model='a' body='arm' prefix='{i}'/></frame>" for i in range(4))
-    whole = "<asset><model name='a' file='frame/arm.xml'/></asset><worldbody><body><geom size='0.1' mass='1'/>" + stars
-    (tmp_path / "x.xml").write_text(f"<mujoco>{whole}</body></worldbody></mujoco>")
+    arms = (f"<frame euler='0 0 {x}'><attach model='a' body='arm' prefix='{x}'/></frame>" for x in (0, 90, 180, 270))
+    whole = "<asset><model name='a' file='frame/arm.xml'/></asset><worldbody><body><geom size='0.1' mass='1'/>"
+    (tmp_path / "x.xml").write_text(f"<mujoco>{whole}{''.join(arms)}</body></worldbody></mujoco>")
     drone = load_drone(tmp_path / "x.xml", **REST, rotor_speed_max=1000, rotor_spin=[1, -1, 1, -1])
     np.testing.assert_allclose(drone.rotor_positions, PLUS["rotor_positions"], atol=1e-6)
     monkeypatch.chdir(tmp_path / "2")

@@ -82,6 +82,15 @@ class Said:
             raise UserValueError(f"{self.source}: {name!r} has shape {array.shape}; it must be ({want}).")
         return array
 
+    def has(self, *names: str) -> bool:
+        """Whether all of these names have a value; it does not ask for them."""
+        return all(self.data.get(name) is not None for name in names)
+
+    @property
+    def unread(self) -> list[str]:
+        """The names that nobody asked for."""
+        return [str(name) for name in self.data if name not in self.asked]
+
     def fields(self, **names: str) -> Found:
         """Fields that the mapping has under other names, as they are."""
         return {field: (self(name, *_shape(field)), "") for field, name in names.items()} | self.given
@@ -179,8 +188,9 @@ def _flightmare(said: Said) -> Found:
         found["thrust_map"] = [most / speed**2, 0.0, 0.0], "from thrust_max at motor_omega_max, as the square of speed"
     elif curve is not None and most is not None and speed is not None and speed_at(most, curve) < speed:
         found["rotor_speed_max"] = speed_at(most, curve), "at thrust_max, before motor_omega_max"
-    if (squares := said("quad_drag_coeffs", 3)) is not None and (areas := said("cross_sections", 3)) is not None:
-        found["quadratic_drag"] = 0.5 * 1.225 * squares * areas, "of quad_drag_coeffs and cross_sections, in air"
+    if said.has("quad_drag_coeffs", "cross_sections"):
+        square = 0.5 * 1.225 * said("quad_drag_coeffs", 3) * said("cross_sections", 3)
+        found["quadratic_drag"] = square, "of quad_drag_coeffs and cross_sections, in air"
     if (gravity := said("gravity", *[3] * isinstance(said.data.get("gravity"), list))) is not None:
         found["gravity"] = np.linalg.norm(gravity), ""
     places = [said(f"tbm_{where}", 3) for where in ("fr", "bl", "br", "fl")]
@@ -228,7 +238,7 @@ def _drone_models(said: Said) -> Found:
     found = said.fields(mass="mass", yaw_torque_coefficient="thrust2torque", motor_time_constant=lag)
     found |= diagonal(said("J", 3, 3))
     arm, mix, gravity = said("L"), said("mixing_matrix", 3, "n"), said("gravity_vec", 3)
-    force, torque = said("rpm2thrust", 3), said("rpm2torque", 3)
+    force = said("rpm2thrust", 3)
     curve = None if force is None else force[::-1] / [RPM**2, RPM, 1.0]
     found["thrust_map"] = curve, ""
     if gravity is not None:
@@ -236,6 +246,9 @@ def _drone_models(said: Said) -> Found:
     if mix is not None and arm is not None:
         found |= placed(arm * np.stack([-mix[1], mix[0]], -1), note="L times the mixing matrix")
         found["rotor_spin"] = np.sign(mix[2]), ""
+        if not np.allclose(abs(mix[2]), 1.0):
+            what = f"the third row of mixing_matrix is {listed(mix[2])}, and must be 1 or -1"
+            raise UserValueError(f"{said.source}: {what}. Write the rest of it into thrust2torque or rpm2torque.")
     ends = (("rotor_speed_min", said("thrust_min")), ("rotor_speed_max", said("thrust_max")))
     for end, newton in ends:
         if newton is not None and curve is not None:
@@ -246,11 +259,12 @@ def _drone_models(said: Said) -> Found:
         found.setdefault("linear_drag", (np.abs(np.diag(drag)), f"drag_matrix{part}"))
     if curve is None or mass is None or mix is None:
         return found
-    hover, lags = speed_at(9.81 * mass / mix.shape[1], curve) / RPM, said("rotor_dyn_coef", 4)
-    if torque is not None and found["yaw_torque_coefficient"][0] is None:
+    hover = speed_at(9.81 * mass / mix.shape[1], curve) / RPM
+    if found["yaw_torque_coefficient"][0] is None and (torque := said("rpm2torque", 3)) is not None:
         powers = hover ** np.arange(3)
         found["yaw_torque_coefficient"] = torque @ powers / (force @ powers), "rpm2torque per rpm2thrust, at hover"
-    if lags is not None and found["motor_time_constant"][0] is None:  # of speed and of its square, up and down
+    if found["motor_time_constant"][0] is None and (lags := said("rotor_dyn_coef", 4)) is not None:
+        # of speed and of its square, up and down
         found["motor_time_constant"] = 1.0 / (lags[::2] + 2.0 * hover * lags[1::2]), "rotor_dyn_coef, about hover"
     return found
 
@@ -258,14 +272,15 @@ def _drone_models(said: Said) -> Found:
 def _rotorpy(said: Said) -> Found:
     names = {x: x for x in ("mass", "rotor_speed_min", "rotor_speed_max")}
     found = said.fields(motor_time_constant="tau_m", rotor_spin="rotor_directions", **names)
-    moments, drag = [said(f"I{axes}") for axes in AXES], [said(f"c_D{axis}") for axis in "xyz"]
+    moments, drag = [said(f"I{axes}") for axes in AXES], [f"c_D{axis}" for axis in "xyz"]
     k2, torque, places = said("k_eta"), said("k_m"), said("rotor_pos", "n", 3)
     said.asked.add("num_rotors")
     found |= placed(places)
     if all(x is not None for x in moments[:3]):
         found |= diagonal(symmetric(*(x or 0.0 for x in moments)))
-    if all(x is not None for x in drag):
-        found["quadratic_drag"] = np.array(drag), "of each axis by itself; in RotorPy times the whole speed"
+    if said.has(*drag):
+        each = np.array([said(x) for x in drag])
+        found["quadratic_drag"] = each, "of each axis by itself; in RotorPy times the whole speed"
     if k2 is not None:
         found["thrust_map"] = [k2, 0.0, 0.0], ""
         found["yaw_torque_coefficient"] = (None if torque is None else torque / k2), "k_m per k_eta"
@@ -283,8 +298,8 @@ def _by_angles(said: Said) -> Found:
     said.asked |= {"rotor_configuration", "inertia"}
     by_number = isinstance(rotors, Mapping) and all(isinstance(x, Mapping) for x in rotors.values())
     if by_number:
-        each = [rotors[k] for k in sorted(rotors, key=lambda k: str(k).zfill(3))]
-        rotors = {theirs: [x[ours] for x in each] for ours, theirs in names.items() if all(ours in x for x in each)}
+        each = [rotors[k] for k in sorted(rotors, key=lambda k: str(k).zfill(3))] or [{}]
+        rotors = {names.get(key, key): [x[key] for x in each] for key in each[0] if all(key in x for x in each)}
     part = Said(rotors if isinstance(rotors, Mapping) else {}, f"{said.source}: rotor_configuration", {})
     n = next((len(x) for x in part.data.values() if isinstance(x, list)), "n")
     angle, arm, turn, force, torque = (part(name, n) for name in names.values())
@@ -302,6 +317,8 @@ def _by_angles(said: Said) -> Found:
         found["thrust_map"] = (None if k2 is None else [k2, 0.0, 0.0]), why
         if torque is not None:  # of RotorS per force
             found["yaw_torque_coefficient"] = same(torque / (1.0 if by_number else force), "their moment constants")
+    part.asked.add("num_rotors")
+    said.data = {**said.data, **{f"{x} of rotor_configuration": 0 for x in part.unread}}
     return found
 
 

@@ -89,7 +89,7 @@ def read_model(root: ET.Element, path: Path, given: Found) -> tuple[str, str, Fo
         values = {name: presets.parse(text.encode(), name) for name, text in properties.attrib.items()}
         said = Said(values, str(path), given)
         _add_attributes(found, said, root.get("name", ""))
-        return str(path), "URDF of gym-pybullet-drones", found, [x for x in values if x not in said.asked]
+        return str(path), "URDF of gym-pybullet-drones", found, said.unread
     return str(path), "URDF" if root.tag == "robot" else "SDF", found, unread
 
 

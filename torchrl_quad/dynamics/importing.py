@@ -234,4 +234,4 @@ def _read(drone: Any, entry: str | None, fields: Mapping[str, Any]) -> tuple[str
     kind, reader, part = drones[entry] if entry is not None else next(iter(drones.values()))
     said = Said(part, source, usable(fields))
     found = reader(said)
-    return source, kind, found, [str(key) for key in part if key not in said.asked]
+    return source, kind, found, said.unread

@@ -182,6 +182,7 @@ def test_a_fixed_scene_comes_from_a_file_and_stands_in_no_state(tmp_path):
     (lambda: ForestEnv(speed=(5.0, 2.0)), "speed must be one speed"),
     (lambda: ForestEnv(difficulty="wild"), "difficulty must be 'easy', 'middle' or 'hard', got 'wild'. How dense"),
     (lambda: HoveringEnv(scene={}), "a scene needs an obstacle or the ground: give it one"),
+    (lambda: HoveringEnv(scene={"ground": True, "clearance": 1.0}), "clearance is of obstacles with a count"),
     (lambda: HoveringEnv(scene={"trees": []}), "scene: unknown key 'trees'. Allowed: ground"),
     (lambda: HoveringEnv(scene={"spheres": [{"centre": [1, 0], "radius": 1}]}), "centre must be 3 numbers"),
     (lambda: HoveringEnv(scene={"spheres": [{"centre": [1, 0, 1]}]}), "missing: radius"),

@@ -346,6 +346,8 @@ SQUARE = {"position": [0, 0, 2], "yaw": 0.0, **OPEN}
     ({"gates": [SQUARE, SQUARE], "gate_radius": 0.3}, {}, "gate_radius is of gates that are points; .* Give radius"),
     ({"random": {"heights": [-1, 4]}}, {"radius": 1.0}, "random: heights must be above the floor at 0 m; got .-1, 4."),
     ({"random": {}, "box": [[-5, -9, 0], [9, 9, 5]]}, {"radius": 1.0}, "6 gates .* need 6 m to all sides .* up to 5 m"),
+    ({"gates": [SQUARE] * 2, "radius": 1.0}, {}, "each gate says how far it is open, so radius of"),
+    ({"gates": [[0, 0, 1]] * 2, "floor": 0, "box": [[-5, -5, 0], [5, 5, 5]]}, {}, "floor has no effect beside box"),
     ({"random": {}, "starts": [[0, 0, 2]] * 6}, {"radius": 1.0}, "random draws gates and their starts. Leave out"),
 )  # fmt: skip
 def test_a_track_that_does_not_say_enough_is_refused_and_asks_by_name(track, settings, message):
@@ -367,6 +369,10 @@ def test_what_is_given_with_a_track_replaces_what_the_track_says_and_its_result_
     gates = [{"position": torch.tensor(x["position"]), "rotation": np.array(x["rotation"])} for x in gates]
     again = load_track({"gates": gates}, width=1.5, height=1.5)
     assert [gate["rotation"] for gate in again["gates"]] == [gate["rotation"] for gate in track["gates"]]
+    boxed = load_track("airsim", box=[[-200, -200, -70], [200, 200, 70]])
+    assert "floor" not in boxed and RacingEnv(num_envs=1, track=boxed).floor == -70
+    row = {str(k): {"pos": [4 * k, 0, 1], "yaw": 0} for k in (1, 2)}
+    assert load_track(row, lift=0, radius=1.0, scene={"ground": True})["scene"] == {"ground": True}
     (tmp_path / "self.yaml").write_text(f"file: {tmp_path}/self.yaml")
     refuses("self.yaml: 10 tracks name each other as file; does one name itself", load_track, tmp_path / "self.yaml")
 

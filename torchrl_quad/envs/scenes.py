@@ -69,7 +69,7 @@ class Scene(Disturbance):
         spheres, cylinders, boxes, walls: lists of mappings as above; walls are all fixed. Lengths are 0.001 to 10,000
             m, coordinates within 10 km.
         clearance: the least distance from the drone's surface to random obstacles at its start, and at its target, 0 to
-            100 m.
+            100 m; by default 0.3 m.
         drone_radius: of the sphere around the drone's centre that must not touch anything, 0.001 to 10 m; by default
             that of a sphere around the propellers, as large as they can be without touching each other.
         source: what errors call the scene.
@@ -91,11 +91,12 @@ class Scene(Disturbance):
         cylinders: Obstacles = (),
         boxes: Obstacles = (),
         walls: Obstacles = (),
-        clearance: Annotated[float, between(0.0, 100.0)] = 0.3,
+        clearance: Annotated[float, between(0.0, 100.0)] | None = None,
         drone_radius: Annotated[float, between(1e-3, 10.0)] | None = None,
         source: str = "scene",
     ) -> None:
-        self.source, self.ground, self.clearance, self.drone_radius = source, ground, clearance, drone_radius
+        self.source, self.ground, self.drone_radius = source, ground, drone_radius
+        self.clearance = 0.3 if clearance is None else clearance
         self.fixed: dict[str, list[list[float]]] = {kind: [] for kind in SIZES}
         self.random: dict[str, list[dict[str, Any]]] = {kind: [] for kind in SIZES}
         if ground:
@@ -106,6 +107,8 @@ class Scene(Disturbance):
         count = sum(len(x) for x in self.fixed.values()) + sum(x["count"] for y in self.random.values() for x in y)
         if count > MAX_OBSTACLES:
             raise UserValueError(f"{count:,} obstacles are too many; the maximum is {MAX_OBSTACLES:,}.")
+        if clearance is not None and not any(self.random.values()) and type(self).draw is Scene.draw:
+            raise UserValueError("clearance is of obstacles with a count, and there are none. Leave it out.")
         if not count:
             raise UserValueError("a scene needs an obstacle or the ground: give it one.")
 

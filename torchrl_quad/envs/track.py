@@ -39,6 +39,7 @@ _REPLACES = {
     **dict.fromkeys(_SIZES, _SIZES),
     "gates": ("random", "start", "starts"),
     "random": ("gates", "start", "starts"),
+    "box": ("floor",),
 }
 MAX_FILES = 10  # of tracks that change each other
 _KEYS = {  # what else a track may say, beside its points
@@ -203,6 +204,9 @@ def load_track(track: str | Path | Mapping = "visfly", **settings: Any) -> dict[
         found["box"] = _points(source, "box", values["box"], -1e4)
         if len(found["box"]) != 2 or not all(a < b for a, b in zip(*found["box"], strict=True)):
             raise UserValueError(f"{source}: box must be its lowest and its highest corner, [x, y, z] each.")
+        if "floor" in found:
+            raise UserValueError(f"{source}: floor has no effect beside box, whose lowest z it is. Leave floor out.")
+        floor = found["box"][0][2]
     if "random" in values:
         course = _course(source, values["random"] or {}, found, floor)
         found |= {**shape, "random": asdict(course)}
@@ -315,6 +319,9 @@ def _directed(source: str, raw: Sequence[Any], shape: Mapping[str, Any], has_rad
     if has_radius:
         mend = "Give radius, or width and height."
         raise UserValueError(f"{source}: gate_radius is of gates that are points; these have a direction. {mend}")
+    if shape and all(set(gate) & set(_OPENING) for gate in raw):
+        what = f"each gate says how far it is open, so {', '.join(shape)} of the track has no effect"
+        raise UserValueError(f"{source}: {what}. Leave it out.")
     raw = [{k: x.tolist() if isinstance(x, Tensor | np.ndarray) else x for k, x in gate.items()} for gate in raw]
     own = [gate if set(gate) & set(_OPENING) else {**gate, **shape} for gate in raw]
     gates = [build(Gate, f"{source}: gate {i}", gate).entries() for i, gate in enumerate(own, 1)]

@@ -36,7 +36,7 @@ def own_format(source: str, values: Mapping[str, Any]) -> dict[str, Any]:
         values = {**values.pop("track_config"), **values}
     gates = values.get("gates")
     by_name = gates if isinstance(gates, Mapping) else values
-    named = {name: gate for name, gate in by_name.items() if isinstance(gate, Mapping)}
+    named = {name: x for name, x in by_name.items() if isinstance(x, Mapping) and name not in ("scene", "random")}
     try:
         if isinstance(values.get("env"), Mapping):
             return lsy_drone_racing(source, values)
@@ -76,7 +76,7 @@ def agile_flight(source: str, values: dict[str, Any], gates: list[Mapping[str, A
         "scale and uncertainty are not read",
     ]
     turned, floor = multiply(rotations, AXES[axis]), {}
-    if centres[:, 2].min() <= 0.0:
+    if centres[:, 2].min() <= 0.0 and "box" not in values:
         floor["floor"] = float(centres[:, 2].min()) - BELOW
         notes.append(f"gates are below z = 0: the floor is {BELOW:g} m below the lowest")
     own = {key: x for key, x in values.items() if key not in ("start_pos", "goal_pos", "render_offset", "axis")}
@@ -146,7 +146,7 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
     axis = _axis(source, axis, start, centres, rotations, False, LSY_FRAMES)
     rotations, size = multiply(rotations, AXES[axis]), track.get("gate_size") or {}
     own = {"width": size.get("width", LSY_OPENING), "height": size.get("height", LSY_OPENING), **own}
-    own = {"frame": LSY_FRAMES[axis], "closed": False, "box": box, "start_range": 0.05, "floor": box[0][2], **own}
+    own = {"frame": LSY_FRAMES[axis], "closed": False, "box": box, "start_range": 0.05, **own}
     notes = [
         f"gates are flown along their {axis} axis",
         f"they are open {shown(own['width'])} x {shown(own['height'])} m, with frames of {shown(own['frame'])} m",
@@ -192,7 +192,8 @@ def isaac_drone_racer(source: str, values: dict[str, Any], gates: list[Mapping[s
     """The ``track_config`` of kousheekc/isaac_drone_racer: positions of its gates' models, flown along their x axis."""
     if "lift" not in values:
         raise UserValueError(f"{source}: how high above pos its gates are open is not said. Give lift [m].")
-    own = {key: x for key, x in values.items() if key not in ("lift", "gates") and not isinstance(x, Mapping)}
+    named = [key for key, x in values.items() if isinstance(x, Mapping) and "pos" in x]
+    own = {key: x for key, x in values.items() if key not in ("lift", "gates", *named)}
     listed = [{"position": [*gate["pos"][:2], gate["pos"][2] + values["lift"]], "yaw": gate["yaw"]} for gate in gates]
     return {**own, "gates": listed, "notes": ["gates are flown along their x axis, and round after round"]}
 

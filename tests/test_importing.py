@@ -159,6 +159,8 @@ HOVER, FAST = np.sqrt(9.81 * 2 / 4 / 1e-5), 2 * np.pi / 60  # of a rotor of the 
      "mass", "inertia", "rotor_spin", "thrust_map", "linear_drag", "quadratic_drag")}),
     ("x.json", json.dumps({"dynamics": {**L2F, "rotor_thrust_coefficients": [0.1, 0.5, 5.0]}}),
      {"linear_drag": [0.1] * 3}, {"thrust_map": [5e-6, 5e-4, 0.1]}),
+    ("x.json", json.dumps({**L2F, "J_inv": np.diag([104, 100, 65]).tolist()}), {"linear_drag": [0.1] * 3},
+     {"inertia": [1 / 104, 1 / 100, 1 / 65]}),
     ("x.yaml", json.dumps(OMNI), REST, PLUS | {"rotor_speed_max": 838,
      "unread": "Not read: drag_coef, tau of rotor_configuration"}),
     ("x.yaml", json.dumps(ROTORS), REST | {"rotor_speed_max": 838}, PLUS | {"mass": 0.7}),
@@ -379,10 +381,16 @@ def test_rotors_are_found_by_their_names_and_axes_and_what_follows_from_a_given_
 
 def test_the_recipe_writes_a_drone_from_a_model_and_what_it_includes(tmp_path, monkeypatch, capsys):
     script = Path(__file__).parents[1] / "recipes/import_drone.py"
-    (tmp_path / "frame.sdf").write_text(sdf(FRAME))
-    (tmp_path / "x.sdf").write_text(sdf(f"<include><uri>model://frame</uri></include>{motors()}"))
+    include = "<include><uri>model://{}</uri></include>" + motors()
+    (tmp_path / "x.sdf").write_text(sdf(include.format("frame")))
+    (tmp_path / "tilted.sdf").write_text(sdf(FRAME + TILTING))
+    (tmp_path / "y.sdf").write_text(sdf(include.format("tilted")))
+    refuses("the joint 'tilt' turns the rotor 'rotor_0'", load_drone, tmp_path / "y.sdf")
+    slowed = FRAME.replace("<inertial>", "<velocity_decay><linear>1</linear></velocity_decay><inertial>", 1)
+    (tmp_path / "frame.sdf").write_text(sdf(slowed))
     monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "x.sdf"), "mass=3", f"output={tmp_path}/o/x.yaml"])
     runpy.run_path(str(script), run_name="__main__")
+    assert "# Not read: velocity_decay/linear." in (tmp_path / "o/x.yaml").read_text()
     assert load_drone(tmp_path / "o/x.yaml").mass == 3.0 and f"env.drone={tmp_path}/o/x.yaml" in capsys.readouterr().out
     for output, said in (("x.urdf", "its name must end in .yaml"), (f"{tmp_path}/o/x.yaml", "says something else")):
         monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "x.sdf"), "mass=4", f"output={output}"])

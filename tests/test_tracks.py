@@ -346,6 +346,7 @@ SQUARE = {"position": [0, 0, 2], "yaw": 0.0, **OPEN}
     ({"gates": [SQUARE, SQUARE], "gate_radius": 0.3}, {}, "gate_radius is of gates that are points; .* Give radius"),
     ({"random": {"heights": [-1, 4]}}, {"radius": 1.0}, "random: heights must be above the floor at 0 m; got .-1, 4."),
     ({"random": {}, "box": [[-5, -9, 0], [9, 9, 5]]}, {"radius": 1.0}, "6 gates .* need 6 m to all sides .* up to 5 m"),
+    ({"random": {"yaw": 0.1}}, {"gate_radius": 1.0}, "random: yaw has no effect on gates that are spheres"),
     ({"gates": [SQUARE] * 2, "radius": 1.0}, {}, "each gate says how far it is open, so radius of"),
     ({"gates": [[0, 0, 1]] * 2, "floor": 0, "box": [[-5, -5, 0], [5, 5, 5]]}, {}, "floor has no effect beside box"),
     ({"random": {}, "starts": [[0, 0, 2]] * 6}, {"radius": 1.0}, "random draws gates and their starts. Leave out"),
@@ -360,7 +361,7 @@ def test_what_is_given_with_a_track_replaces_what_the_track_says_and_its_result_
     assert load_track(track, start=[0, 0, 3])["starts"] == [[0, 0, 3], *track["starts"][1:]]
     other = load_track({"file": "visfly", "gates": [[0, 0, 1], [4, 0, 1]]})
     assert other["starts"] == [[2, 0, 1]] * 2 and other["gate_radius"] == 0.3
-    for name in ("random", "six_gates"):
+    for name in ("random", "six_gates", load_track("random", random={}, gate_radius=0.4)):
         assert load_track(load_track(name)) == load_track(name)
     changed = load_track(load_track("random"), width=2.0, height=1.0, floor=0.9)
     assert changed["gates"][0]["width"] == 2.0 and changed["random"] == load_track("random")["random"]

@@ -216,8 +216,10 @@ def _l2f(said: Said) -> Found:
     said.asked |= {"hovering_throttle_relative"}
     inertia, inverse = said("J", 3, 3), said("J_inv", 3, 3)
     found = said.fields(mass="mass") | diagonal(inertia) | placed(places, up)
-    if inertia is not None and inverse is not None and not np.allclose(inertia @ inverse, np.eye(3), atol=0.05):
-        found["inertia"] = None, "J_inv is not the inverse of J"
+    if inertia is not None and inverse is not None:
+        is_one = np.allclose(inertia @ inverse, np.eye(3), atol=0.05)
+        exact = diagonal(np.linalg.inv(inverse), "the inverse of J_inv, which has more digits") if is_one else {}
+        found |= exact or {"inertia": (None, "J_inv is not the inverse of J")}
     if up is not None and torque is not None:
         found["rotor_spin"] = np.sign((up * torque).sum(-1)), ""
     if gravity is not None:

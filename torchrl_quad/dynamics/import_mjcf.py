@@ -87,6 +87,7 @@ def read_mjcf(path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
     unread = [f"the body {model.body(x).name or x}, which moves by itself" for x in others if x not in shared]
     unread += ["drag of MuJoCo's air (density, viscosity)"] if model.opt.density or model.opt.viscosity else []
     unread += ["drag of joints (damping)"] if model.dof_damping.any() else []
+    unread += ["what carries bodies (gravcomp)"] if model.body_gravcomp[own].any() else []
     left = [i for i in at_sites if i not in (*some, *turners)]
     unread += [f"the actuator {model.actuator(i).name or i}, which is no rotor" for i in left]
     if rotors:
@@ -161,6 +162,7 @@ def _compiled(path: Path) -> tuple[Any, Any]:
             roots = spec.worldbody.bodies
             flown = [x for x in roots if any(site.name in at for site in x.find_all("site"))]
             flown = flown or [x for x in roots if x.find_all("joint")] or roots
+            flown = roots if spec.compiler.settotalmass > 0.0 else flown  # which all masses share
             around = [x for root in roots if root not in flown for x in (root, *root.find_all("body"))]
             for x in around:
                 x.mass, x.inertia, x.explicitinertial = 1e-6, (1e-6,) * 3, True  # other parts need not be there

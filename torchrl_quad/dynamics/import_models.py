@@ -43,17 +43,17 @@ Links = dict[str, tuple[float, Array, Array, Array]]
 
 def read_model(root: ET.Element, path: Path, given: Found) -> tuple[str, str, Found, list[str]]:
     """Of a URDF or SDF: its path, its kind, what it says, and which of its attributes were not read."""
-    links, plugins = Links(), list[ET.Element]()
-    drone, models = root, [root] if root.tag == "model" else [*root.iterfind("model"), *root.iterfind("world/model")]
+    links, parts = Links(), [root]  # what is read: the drone, and what it includes
+    models = [root] if root.tag == "model" else [*root.iterfind("model"), *root.iterfind("world/model")]
     if root.tag == "robot":
         _add_urdf(root, links, str(path))
-        plugins += root.iter("plugin")
     elif models:
-        drone = max(models, key=lambda model: len([*model.iter("plugin"), *model.iter("include")]))  # not the ground
-        _add_sdf(drone, np.eye(4), path, links, plugins)
+        parts = [max(models, key=lambda model: len([*model.iter("plugin"), *model.iter("include")]))]  # not the ground
+        _add_sdf(parts[0], np.eye(4), path, links, parts)
+    plugins = {y: None for x in parts for y in x.iter("plugin")}  # each once, in their order
     world = UserValueError(f"{path}: a world that includes its models. Give the file of the drone's own model.")
     includes = root.find("world/include") is not None
-    if drone is root and root.tag not in ("robot", "model"):
+    if not models and root.tag != "robot":
         what = f"XML with the root <{one_line(root.tag)}> is no URDF or SDF with a model. {READABLE}"
         raise world if includes else UserValueError(f"{path}: {what}")
     motors = sorted(
@@ -80,11 +80,13 @@ def read_model(root: ET.Element, path: Path, given: Found) -> tuple[str, str, Fo
     blades = {*map(_last, rotors)}
     if any(_last(x.findtext("link_name")) not in blades for x in lifts):
         raise UserValueError(f"{path}: it has wings (LiftDrag), and a drone here has rotors alone. Take a multicopter.")
-    held = _held_joints(drone, [_last(x) for x in rotors], path)
+    held = _held_joints(parts, [_last(x) for x in rotors], path)
     found = one_body(links, rotors, bool(motors), held) | given
     _add_motors(found, motors, str(path), given)
     dropped = ("velocity_decay/linear", "velocity_decay/angular", "rollingMomentCoefficient")
-    unread = [x for x in dropped if any((y.text or "").strip("0. \n\t") for y in root.iterfind(f".//{x}"))]
+    unread = [
+        x for x in dropped if any((y.text or "").strip("0. \n\t") for part in parts for y in part.iterfind(f".//{x}"))
+    ]
     if (properties := root.find("properties")) is not None and root.tag == "robot":
         values = {name: presets.parse(text.encode(), name) for name, text in properties.attrib.items()}
         said = Said(values, str(path), given)
@@ -93,13 +95,13 @@ def read_model(root: ET.Element, path: Path, given: Found) -> tuple[str, str, Fo
     return str(path), "URDF" if root.tag == "robot" else "SDF", found, unread
 
 
-def _held_joints(drone: ET.Element, rotors: Sequence[str], path: Path) -> list[str]:
+def _held_joints(parts: Sequence[ET.Element], rotors: Sequence[str], path: Path) -> list[str]:
     """Refuse rotors that a joint turns against the body; the joints of other parts that move, which are read as fixed.
 
     A rotor spins by the first joint above it that turns about z. What is above all rotors moves the whole drone.
     """
     joints = {}
-    for joint in drone.iter("joint"):
+    for joint in (x for part in parts for x in part.iter("joint")):
         ends = [joint.find(name) for name in ("parent", "child")]
         parent, child = ("" if x is None else _last(x.get("link") or x.text) for x in ends)
         if parent and child:
@@ -215,9 +217,10 @@ def _add_urdf(root: ET.Element, links: Links, source: str) -> None:
 
 
 def _add_sdf(
-    model: ET.Element, outer: Array, path: Path, links: Links, plugins: list[ET.Element], depth: int = 0
+    model: ET.Element, outer: Array, path: Path, links: Links, parts: list[ET.Element], depth: int = 0
 ) -> dict[str, Array]:
-    """Add the links and plugins of a model and of those within it, in the frame of the outermost; what stands where."""
+    """Add the links of a model and of those within it, in the frame of the outermost, and what is included; what stands
+    where."""
 
     def own(element: ET.Element) -> Array:
         pose = _numbers(element.findtext("pose"), 6, str(path))
@@ -240,16 +243,15 @@ def _add_sdf(
 
     names = {x.get("name", ""): x for x in model if x.tag in ("link", "joint", "frame", "model")}
     inside = dict[str, Array]()  # what the models within have
-    plugins += model.iterfind("plugin")
     for inner in (x for x in model if x.tag in ("model", "include")):
         file, said, place = path, inner, standing(inner)
         if inner.find("placement_frame") is not None:
             raise UserValueError(f"{path}: a placement_frame is not read. Write the pose of the model's own frame.")
         if inner.tag == "include":
-            plugins += inner.iterfind("plugin")
             file, said = _included(path, inner.findtext("uri", ""))
+            parts.append(said)
             place = place if inner.find("pose") is not None else place @ own(said)
-        found = _add_sdf(said, place, file, links, plugins, depth + 1)
+        found = _add_sdf(said, place, file, links, parts, depth + 1)
         name = inner.findtext("name") or said.get("name", "")
         inside |= found if inner.get("merge") in ("true", "1") else {f"{name}::{k}": x for k, x in found.items()}
         inside[name] = place

@@ -209,7 +209,8 @@ def load_track(track: str | Path | Mapping = "visfly", **settings: Any) -> dict[
         floor = found["box"][0][2]
     if "random" in values:
         course = _course(source, values["random"] or {}, found, floor)
-        found |= {**shape, "random": asdict(course)}
+        rules = {key: x for key, x in asdict(course).items() if key != "yaw" or "gate_radius" not in found}
+        found |= {**shape, "random": rules}
         raw = _drawn(course, lambda *size: torch.zeros(size, dtype=torch.float64), found)
     directed = turned = None
     if any(isinstance(gate, Mapping) for gate in _rows(raw)):
@@ -301,6 +302,8 @@ def forward(rotations: Tensor) -> Tensor:
 
 def _course(source: str, rules: Any, found: Mapping[str, Any], floor: float) -> Course:
     """The rules of a random track, inside its box."""
+    if "gate_radius" in found and isinstance(rules, Mapping) and "yaw" in rules:
+        raise UserValueError(f"{source}: random: yaw has no effect on gates that are spheres. Leave it out.")
     course = build(Course, f"{source}: random", rules)
     if "box" in found:
         sides = np.abs(found["box"])[:, :2] - np.array(found.get("position_jitter", (0.0, 0.0, 0.0)))[:2]

@@ -57,17 +57,17 @@ def _once(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
 
 
 class Said:
-    """The numbers of a mapping, by name; it keeps account of the names that were asked for.
+    """The numbers of a mapping, by name; ``unread`` are the names that nobody has asked for.
 
     Fields that are ``given`` beside the file count instead of its own, also for what follows from them.
     """
 
     def __init__(self, data: Mapping[str, Any], source: str, given: Found) -> None:
-        self.data, self.source, self.given, self.asked = data, source, given, set[str]()
+        self.data, self.source, self.given, self.unread = data, source, given, dict.fromkeys(map(str, data))
 
     def __call__(self, name: str, *shape: int | str) -> Any:
         """An array of this shape, in which "n" is any length; or None, where the mapping has no such name."""
-        self.asked.add(name)
+        self.unread.pop(name, None)
         if (value := self.data.get(name)) is None:
             return None
         value = list(value.values()) if isinstance(value, Mapping) else value  # of rotors, r1, r2 and so on
@@ -81,15 +81,6 @@ class Said:
             want = ", ".join(map(str, shape))
             raise UserValueError(f"{self.source}: {name!r} has shape {array.shape}; it must be ({want}).")
         return array
-
-    def has(self, *names: str) -> bool:
-        """Whether all of these names have a value; it does not ask for them."""
-        return all(self.data.get(name) is not None for name in names)
-
-    @property
-    def unread(self) -> list[str]:
-        """The names that nobody asked for."""
-        return [str(name) for name in self.data if name not in self.asked]
 
     def fields(self, **names: str) -> Found:
         """Fields that the mapping has under other names, as they are."""
@@ -188,7 +179,7 @@ def _flightmare(said: Said) -> Found:
         found["thrust_map"] = [most / speed**2, 0.0, 0.0], "from thrust_max at motor_omega_max, as the square of speed"
     elif curve is not None and most is not None and speed is not None and speed_at(most, curve) < speed:
         found["rotor_speed_max"] = speed_at(most, curve), "at thrust_max, before motor_omega_max"
-    if said.has("quad_drag_coeffs", "cross_sections"):
+    if None not in map(said.data.get, ("quad_drag_coeffs", "cross_sections")):
         square = 0.5 * 1.225 * said("quad_drag_coeffs", 3) * said("cross_sections", 3)
         found["quadratic_drag"] = square, "of quad_drag_coeffs and cross_sections, in air"
     if (gravity := said("gravity", *[3] * isinstance(said.data.get("gravity"), list))) is not None:
@@ -213,7 +204,7 @@ def _l2f(said: Said) -> Found:
     places, up, torque = (None if (x := said(name, "n", 3)) is None else x * turn for name in names)
     limit, kappa = said("action_limit", "n"), said("rotor_torque_constants", "n")
     times = [said(f"rotor_time_constants_{name}", "n") for name in ("rising", "falling")]
-    said.asked |= {"hovering_throttle_relative"}
+    said.unread.pop("hovering_throttle_relative", None)
     inertia, inverse = said("J", 3, 3), said("J_inv", 3, 3)
     found = said.fields(mass="mass") | diagonal(inertia) | placed(places, up)
     if inertia is not None and inverse is not None:
@@ -276,11 +267,11 @@ def _rotorpy(said: Said) -> Found:
     found = said.fields(motor_time_constant="tau_m", rotor_spin="rotor_directions", **names)
     moments, drag = [said(f"I{axes}") for axes in AXES], [f"c_D{axis}" for axis in "xyz"]
     k2, torque, places = said("k_eta"), said("k_m"), said("rotor_pos", "n", 3)
-    said.asked.add("num_rotors")
+    said.unread.pop("num_rotors", None)
     found |= placed(places)
     if all(x is not None for x in moments[:3]):
         found |= diagonal(symmetric(*(x or 0.0 for x in moments)))
-    if said.has(*drag):
+    if None not in map(said.data.get, drag):
         each = np.array([said(x) for x in drag])
         found["quadratic_drag"] = each, "of each axis by itself; in RotorPy times the whole speed"
     if k2 is not None:
@@ -297,7 +288,7 @@ def _by_angles(said: Said) -> Found:
     names = {"angle": "rotor_angles", "arm_length": "arm_lengths", "direction": "directions"}
     names |= {"rotor_force_constant": "force_constants", "rotor_moment_constant": "moment_constants"}
     rotors, inertia = (said.data.get(x) for x in ("rotor_configuration", "inertia"))
-    said.asked |= {"rotor_configuration", "inertia"}
+    said.unread = {x: None for x in said.unread if x not in ("rotor_configuration", "inertia")}
     by_number = isinstance(rotors, Mapping) and all(isinstance(x, Mapping) for x in rotors.values())
     if by_number:
         each = [rotors[k] for k in sorted(rotors, key=lambda k: str(k).zfill(3))] or [{}]
@@ -319,8 +310,7 @@ def _by_angles(said: Said) -> Found:
         found["thrust_map"] = (None if k2 is None else [k2, 0.0, 0.0]), why
         if torque is not None:  # of RotorS per force
             found["yaw_torque_coefficient"] = same(torque / (1.0 if by_number else force), "their moment constants")
-    part.asked.add("num_rotors")
-    said.data = {**said.data, **{f"{x} of rotor_configuration": 0 for x in part.unread}}
+    said.unread |= {f"{x} of rotor_configuration": None for x in part.unread if x != "num_rotors"}
     return found
 
 

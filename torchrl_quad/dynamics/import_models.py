@@ -56,9 +56,8 @@ def read_model(root: ET.Element, path: Path, given: Found) -> tuple[str, str, Fo
     if not models and root.tag != "robot":
         what = f"XML with the root <{one_line(root.tag)}> is no URDF or SDF with a model. {READABLE}"
         raise world if includes else UserValueError(f"{path}: {what}")
-    motors = sorted(
-        (x for x in plugins if x.find("motorConstant") is not None), key=lambda x: _digits(x.findtext("motorNumber"))
-    )
+    motors = [x for x in plugins if x.find("motorConstant") is not None]
+    motors.sort(key=lambda x: _digits(x.findtext("motorNumber")))
     short = {_last(name): name for name in links}
     motor_links = [(x.findtext("linkName") or "").strip() for x in motors]
     rotors = [x if x in links else short.get(_last(x), "") for x in motor_links]
@@ -84,14 +83,12 @@ def read_model(root: ET.Element, path: Path, given: Found) -> tuple[str, str, Fo
     found = one_body(links, rotors, bool(motors), held) | given
     _add_motors(found, motors, str(path), given)
     dropped = ("velocity_decay/linear", "velocity_decay/angular", "rollingMomentCoefficient")
-    unread = [
-        x for x in dropped if any((y.text or "").strip("0. \n\t") for part in parts for y in part.iterfind(f".//{x}"))
-    ]
+    unread = [x for x in dropped if any((y.text or "").strip("0. \n\t") for z in parts for y in z.iterfind(f".//{x}"))]
     if (properties := root.find("properties")) is not None and root.tag == "robot":
         values = {name: presets.parse(text.encode(), name) for name, text in properties.attrib.items()}
         said = Said(values, str(path), given)
         _add_attributes(found, said, root.get("name", ""))
-        return str(path), "URDF of gym-pybullet-drones", found, said.unread
+        return str(path), "URDF of gym-pybullet-drones", found, [*said.unread]
     return str(path), "URDF" if root.tag == "robot" else "SDF", found, unread
 
 
@@ -233,9 +230,7 @@ def _add_sdf(
         if base in names and steps < DEPTH:
             return standing(names[base], steps + 1) @ own(element)
         if base not in ("", "__model__", "world", *names, *inside):
-            raise UserValueError(
-                f"{path}: a pose is relative to {shown(base)}, which is no link, joint, frame or model."
-            )
+            raise UserValueError(f"{path}: a pose names {shown(base)}, which is no link, joint, frame or model.")
         return inside.get(base, outer) @ own(element)
 
     if depth > DEPTH // 2:

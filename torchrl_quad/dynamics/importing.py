@@ -36,17 +36,6 @@ CONVERT = {  # programs that write such files, and how to run them
     ".py": "Of RotorPy, write the parameters as JSON first: "
     "json.dump(quad_params, file, default=lambda x: x.tolist()).",
 }
-ASKED = {  # what nobody can guess, as one could give it
-    "mass": "0.5",
-    "inertia": "[2e-3, 2e-3, 4e-3]",
-    "rotor_positions": "[[0.1, 0.1], [-0.1, 0.1], [-0.1, -0.1], [0.1, -0.1]]",
-    "rotor_spin": "[1, -1, 1, -1]",
-    "yaw_torque_coefficient": "0.016",
-    "thrust_map": "[2e-6, 0, 0]",
-    "rotor_speed_max": "1500",
-    "motor_time_constant": "0.03",
-    "linear_drag": "[0.1, 0.1, 0.1]",
-}
 
 
 def load_drone(
@@ -167,23 +156,28 @@ def _completed(
 def _examples(found: Found) -> dict[str, str]:
     """What could be given for each field: spins that alternate around the drone, and three times its weight."""
     mass, speed, places = (found.get(x, (None,))[0] for x in ("mass", "rotor_speed_max", "rotor_positions"))
-    n, spin = 4, ASKED["rotor_spin"]
+    n, spin, arm = 4, "[1, -1, 1, -1]", 0.14
     if places is not None:
         around = np.arctan2(*np.asarray(places, float).T[1::-1]).argsort().argsort()
         n, spin = len(around), str([1 - 2 * int(k % 2) for k in around])
+        arm = np.linalg.norm(np.asarray(places, float)[:, :2], axis=1).max()
     usual = ((mass, 0.5), (speed, 1500.0))
     heavy, fast = (float(np.max(x)) if isinstance(x, float | int | np.ndarray) else y for x, y in usual)
     force, curve = 3.0 * 9.81 * heavy / n, found.get("thrust_map", (None,))[0]
-    most = ASKED["rotor_speed_max"] if curve is None else f"{speed_at(force, curve):.4g}"
-    thrust = f"[{force / max(fast, 1.0) ** 2:.2g}, 0, 0]"
-    examples = ASKED | {"rotor_spin": spin, "thrust_map": thrust, "rotor_speed_max": most}
+    axes = re.search(r"beside (\[.*?\])", found.get("inertia", (None, ""))[1])  # whose products are not small
+    examples = {  # of what nobody can guess
+        "mass": "0.5",
+        "inertia": axes[1] if axes else str([float(f"{share * heavy * arm**2:.2g}") for share in (0.3, 0.3, 0.5)]),
+        "rotor_positions": "[[0.1, 0.1], [-0.1, 0.1], [-0.1, -0.1], [0.1, -0.1]]",
+        "rotor_spin": spin,
+        "yaw_torque_coefficient": "0.016",
+        "thrust_map": f"[{force / max(fast, 1.0) ** 2:.2g}, 0, 0]",
+        "rotor_speed_max": "1500" if curve is None else f"{speed_at(force, curve):.4g}",
+        "motor_time_constant": "0.03",
+        "linear_drag": str([float(f"{0.3 * heavy:.2g}")] * 3),
+    }
     if curve is not None and curve[1] < 0.0 < curve[0]:  # thrust falls at first, so that rotors must not stand
         examples["rotor_speed_min"] = f"{-0.55 * curve[1] / curve[0]:.3g}"  # a tenth beyond the lowest thrust
-    examples["linear_drag"] = str([float(f"{0.3 * heavy:.2g}")] * 3)
-    arm = 0.14 if places is None else np.linalg.norm(np.asarray(places, float)[:, :2], axis=1).max()
-    examples["inertia"] = str([float(f"{share * heavy * arm**2:.2g}") for share in (0.3, 0.3, 0.5)])
-    if axes := re.search(r"beside (\[.*?\])", found.get("inertia", (None, ""))[1]):  # whose products are not small
-        examples["inertia"] = axes[1]
     if "rotor_direction" in found and found["rotor_direction"][0] is None:
         examples["rotor_direction"] = str([[0, 0, 1]] * n)
     return {name: example.replace(" ", "") for name, example in examples.items()}  # one word of a command line
@@ -234,4 +228,4 @@ def _read(drone: Any, entry: str | None, fields: Mapping[str, Any]) -> tuple[str
     kind, reader, part = drones[entry] if entry is not None else next(iter(drones.values()))
     said = Said(part, source, usable(fields))
     found = reader(said)
-    return source, kind, found, said.unread
+    return source, kind, found, [*said.unread]

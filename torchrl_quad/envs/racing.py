@@ -144,19 +144,18 @@ class RacingEnv(QuadrotorEnv):
         self.track, self.reward, self.gate_bonus = load_track(track), reward, gate_bonus
         self.observe_directions, self.first_gate = observe_directions, first_gate
         if first_gate is not None and first_gate >= len(self.track["gates"]):
-            raise UserValueError(
-                f"first_gate={first_gate}, and the track has {len(self.track['gates'])} gates, from 0."
-            )
+            raise UserValueError(f"first_gate={first_gate}: the track has {len(self.track['gates'])} gates, from 0.")
         if observe_directions and "gate_radius" in self.track:
-            raise UserValueError(
-                "observe_directions=True needs gates with a direction; those of this track are spheres."
-            )
+            raise UserValueError("observe_directions=True needs gates with a direction; this track has spheres.")
         self.is_closed, self.frame = self.track.get("closed", True), self.track.get("frame", 0.0)
         self.ends_on_success = not self.is_closed
         self.start_range = self.track.get("start_range", self.start_range)
         self.weights = {**WEIGHTS[reward], **RELAXATION_WEIGHTS.get(gate_bonus, {})}
         self.weights["closing"] = 0.0 if "gate_radius" in self.track else 0.5
-        if "scene" in self.track and kwargs.get("scene") is None:
+        if "scene" in self.track:
+            if kwargs.get("scene") is not None:
+                why = "this track has obstacles, and scene has others"
+                raise UserValueError(f"{why}. Write yours into the track: env.track={{file: ..., scene: ...}}.")
             kwargs["scene"] = self.track["scene"]
         super().__init__(num_envs, max_episode_steps=max_episode_steps, **kwargs)
 

@@ -218,9 +218,7 @@ def load_track(track: str | Path | Mapping = "visfly", **settings: Any) -> dict[
         raw, turned = ([gate[key] for gate in directed] for key in ("position", "rotation"))
         turned = torch.tensor(turned, dtype=torch.float64)
     elif _rows(raw) and (extra := [x for x in (*shape, "frame", "rotation_jitter") if x in {**shape, **found}]):
-        raise UserValueError(
-            f"{source}: {extra[0]} is of gates with a direction; these are points, with a gate_radius."
-        )
+        raise UserValueError(f"{source}: {extra[0]} is of gates with a direction; these are points with a gate_radius.")
     gates = _points(source, "gates", raw, floor)
     if not 2 <= len(gates) <= MAX_GATES:
         raise UserValueError(f"{source}: a track has 2 to {MAX_GATES} gates, got {len(gates)}.")

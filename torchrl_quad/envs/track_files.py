@@ -43,7 +43,7 @@ def own_format(source: str, values: Mapping[str, Any]) -> dict[str, Any]:
         if named and isinstance(gates, Mapping) and all({"position", "rotation"} <= set(x) for x in named.values()):
             return agile_flight(source, values, _in_order(named))
         if named and all({"pos", "yaw"} <= set(gate) for gate in named.values()):
-            return isaac_drone_racer(source, values, _in_order(named))
+            return isaac_drone_racer(source, {k: x for k, x in values.items() if k not in named}, _in_order(named))
         if {"initial", "end", "ring"} & set(values):
             return time_optimal(source, values)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
@@ -192,8 +192,7 @@ def isaac_drone_racer(source: str, values: dict[str, Any], gates: list[Mapping[s
     """The ``track_config`` of kousheekc/isaac_drone_racer: positions of its gates' models, flown along their x axis."""
     if "lift" not in values:
         raise UserValueError(f"{source}: how high above pos its gates are open is not said. Give lift [m].")
-    named = [key for key, x in values.items() if isinstance(x, Mapping) and "pos" in x]
-    own = {key: x for key, x in values.items() if key not in ("lift", "gates", *named)}
+    own = {key: x for key, x in values.items() if key not in ("lift", "gates")}
     listed = [{"position": [*gate["pos"][:2], gate["pos"][2] + values["lift"]], "yaw": gate["yaw"]} for gate in gates]
     return {**own, "gates": listed, "notes": ["gates are flown along their x axis, and round after round"]}
 
@@ -219,9 +218,7 @@ def flown_track(path: Path) -> dict[str, Any]:
             try:
                 rows.append([float(row[name] or "nan") for name in wanted])
             except ValueError as error:
-                raise UserValueError(
-                    f"{path}, line {reader.line_num}: {error}. Leave out the row, or the cell."
-                ) from None
+                raise UserValueError(f"{path}, line {reader.line_num}: {error}. Leave out this row.") from None
     table = np.array(rows).reshape(-1, len(wanted))
     flown = table[np.isfinite(table[:, :3]).all(1), :3]
     if len(flown) < 2 or not np.isfinite(table[:, 3:]).any(0).all():

@@ -350,6 +350,7 @@ SQUARE = {"position": [0, 0, 2], "yaw": 0.0, **OPEN}
     ({"random": {}, "box": [[-5, -9, 0], [9, 9, 5]]}, {"radius": 1.0}, "6 gates .* need 6 m to all sides .* up to 5 m"),
     ({"random": {"yaw": 0.1}}, {"gate_radius": 1.0}, "random: yaw has no effect on gates that are spheres"),
     ({"gates": [SQUARE] * 2, "radius": 1.0}, {}, "each gate says how far it is open, so radius of"),
+    ({"gates": [[0, 0, 1], [4, 0, 1], [0, 0, 1]]}, {}, "gates 3 and 1 are equal, and in a row"),
     ({"gates": [[0, 0, 1]] * 2, "floor": 0, "box": [[-5, -5, 0], [5, 5, 5]]}, {}, "floor has no effect beside box"),
     ({"random": {}, "starts": [[0, 0, 2]] * 6}, {"radius": 1.0}, "random draws gates and their starts. Leave out"),
 )  # fmt: skip

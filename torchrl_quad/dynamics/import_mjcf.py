@@ -159,10 +159,9 @@ def _compiled(path: Path) -> tuple[Any, Any]:
             spec = mujoco.MjSpec.from_file(str(path))
             spec.memory, spec.compiler.fusestatic = -1, False
             at = {x.target for x in spec.actuators if x.trntype == mujoco.mjtTrn.mjTRN_SITE}
-            roots = spec.worldbody.bodies
-            flown = [x for x in roots if any(site.name in at for site in x.find_all("site"))]
+            roots, whole = spec.worldbody.bodies, spec.compiler.settotalmass > 0.0  # which all masses share
+            flown = [x for x in roots if whole or any(site.name in at for site in x.find_all("site"))]
             flown = flown or [x for x in roots if x.find_all("joint")] or roots
-            flown = roots if spec.compiler.settotalmass > 0.0 else flown  # which all masses share
             around = [x for root in roots if root not in flown for x in (root, *root.find_all("body"))]
             for x in (x for x in around if not x.explicitinertial):
                 x.mass, x.inertia, x.explicitinertial = 1e-6, (1e-6,) * 3, True  # other parts need not be there

@@ -101,7 +101,8 @@ class RacingEnv(QuadrotorEnv):
     - ``starts``, a point before each gate [m], by default half way from the gate before, or up to 3 m before a gate
       with a direction; ``start``, only the first; ``start_range``, 0.2 m;
     - ``closed``, whether the first gate follows the last, true;
-    - ``floor`` [m], 0; ``box``, the lowest and the highest corner [m] of where drones may be, instead of 4 m of room;
+    - ``floor`` [m], 0; or ``box``, the lowest and the highest corner [m] of where drones may be, with its own floor,
+      instead of 4 m of room;
     - ``position_jitter`` [m], ``rotation_jitter`` [rad], three numbers each: how far each episode moves gates;
     - ``random``, instead of gates: the rules (:class:`~torchrl_quad.envs.track.Course`) by which each episode draws
       other gates;

@@ -226,6 +226,9 @@ def load_track(track: str | Path | Mapping = "visfly", **settings: Any) -> dict[
         found["gates"] = [{**gate, "position": point} for gate, point in zip(directed, gates, strict=True)]
     else:
         found |= {"gates": gates, "gate_radius": float(found.get("gate_radius", 0.3))}
+    before = found["gates"][-1:] if found.get("closed", True) else [None]
+    if k := next((i for i, gate in enumerate(found["gates"], 1) if gate == [*before, *found["gates"]][i - 1]), 0):
+        raise UserValueError(f"{source}: gates {k - 1 or len(gates)} and {k} are equal, and in a row. Leave one out.")
     usual = starts_before(torch.tensor(gates, dtype=torch.float64), turned, floor).tolist()
     found["starts"] = _points(source, "starts", values.get("starts", usual), floor)
     if (given := len(found["starts"])) != len(gates):

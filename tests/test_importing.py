@@ -233,6 +233,8 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_given(
     ("x.xml", MJCF, r"thrust_map .* from 6 N, the most of its actuators, and rotor_speed_max, rotor_speed_m"),
     ("x.xml", MJCF.replace(" 2 0 0", " 0 0 0"), "rotor_positions .* no actuators push at sites, one for each rotor"),
     ("x.xml", MJCF.replace(" ctrllimited='true'", " ctrllimited='false'"), "thrust_map .* no range bounds the force"),
+    ("x.xml", MJCF.replace("<general site='s0'", "<general ctrllimited='false' site='s0'"),
+        "thrust_map .* no range bounds the force"),
     ("x.xml", MJCF.replace("name='spin0' axis='0", "name='k' axis='9"), "the joint 'k' turns rotors, and rotors"),
     ("x.xml", MJCF.replace("name='spin0'", "name='k' type='ball'"), "the joint 'k' turns rotors, and rotors"),
     ("x.xml", MJCF.replace("name='spin0'", "name='k' pos='1 0 0'"), "the joint 'k' turns rotors, and rotors"),

@@ -109,7 +109,7 @@ def _of_motors(mujoco: Any, model: Any, some: Sequence[int], ends: Array, turnin
     lags, times = (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT), model.actuator_dynprm[some, 0]
     if all(mujoco.mjtDyn(x) in lags for x in model.actuator_dyntype[some]) and times.all():
         found["motor_time_constant"] = same(times, "their time constants")
-    most, why = same(abs(ends).max(1), "their greatest forces")
+    most, why = same(abs(ends).max(1) * ends.any(1).all(), "their greatest forces")  # 0 where one has no bounds
     least = abs(ends).min() if (ends.prod(1) > 0.0).all() else 0.0  # of rotors that never stand
     speed, curve = (given.get(x, (None,))[0] for x in ("rotor_speed_max", "thrust_map"))
     if most is None or not most > 0.0:

@@ -192,10 +192,11 @@ def fly_on(env, steps):
 def test_an_environment_that_moves_keeps_its_drone_and_restarts_from_its_seed():
     moved, fresh = HoveringEnv(**OPTIONS), HoveringEnv(**OPTIONS)
     for env in (moved, fresh):
-        env.params = env.params.replace(mass=0.5)
+        env.params = env.params.replace(motor_time_constant=0.05)
     fly_on(moved, 3)
     assert moved.to("cpu:0") is moved and moved.device == moved.randomness.device == torch.device("cpu:0")
-    assert moved.params.mass.item() == 0.5 != moved.nominal.mass.item() == fresh.nominal.mass.item()
+    (lag,), (nominal,) = (x.motor_time_constant.unique().tolist() for x in (moved.params, moved.nominal))
+    assert lag == 0.05 != nominal == fresh.nominal.motor_time_constant.unique().item()
     for _ in range(2):  # the second episode draws on
         assert_equal(fly_on(moved, 5), fly_on(fresh, 5))
     check_env_specs(moved)

@@ -179,7 +179,8 @@ def fits(path: Path, what: str) -> Iterator[None]:
         yield
     except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
         said = (str(error) or repr(error)).split("\n\t")[-1].splitlines()[0]
-        raise UserValueError(f"{path}: {what} in it does not fit its configuration: {said} {_way_out(path)}") from error
+        told = f"{what} in it does not fit its configuration, or is of another version of this package"
+        raise UserValueError(f"{path}: {told}: {said} {_way_out(path)}") from error
 
 
 def revision() -> str:

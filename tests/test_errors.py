@@ -147,11 +147,18 @@ def test_an_action_of_another_shape_or_kind_is_refused_and_not_broadcast(action,
 def test_parameters_and_policies_that_do_not_fit_are_refused(env):
     with pytest.raises(TypeError, match="params must be QuadrotorParams, such as env.params.replace.*; got str"):
         env.params = "visfly"
-    with pytest.raises(ValueError, match="rate_gain would change nothing here: the flight controller keeps the nom"):
+    with pytest.raises(ValueError, match="rate_gain would change nothing here: .* the controller keeps the nominal"):
         env.params = env.params.replace(rate_gain=[10.0] * 3)
     drawn = HoveringEnv(num_envs=4, randomize={"mass": {"scale": [0.8, 1.2]}})
-    with pytest.raises(ValueError, match="randomize draws mass in each episode, .* leave that field out of randomize"):
+    with pytest.raises(ValueError, match="randomize draws mass in each episode, .* give randomize other ranges"):
         drawn.params = drawn.params.replace(mass=0.5)
+    any_drone = HoveringEnv(num_envs=4, control="rotor_thrusts", randomize="any")
+    with pytest.raises(ValueError, match="randomize draws motor_time_constant in each episode"):
+        any_drone.params = any_drone.params.replace(motor_time_constant=0.04)
+    worn = env.nominal.replace(rotor_effectiveness=[0.9, 1.0, 1.0, 1.0])
+    worn = HoveringEnv(num_envs=4, drone=worn, randomize={"rotor_effectiveness": {"scale": [0.9, 1.0]}}).rebuilt(seed=1)
+    with_z = torch.nn.functional.pad(worn.nominal.rotor_positions, (0, 1))
+    worn.params = worn.params.replace(rotor_positions=with_z)  # what is drawn is as it was
     with pytest.raises(ValueError, match='there is none. A policy writes it under "action", as make_actor.env. does'):
         differentiable_rollout(env, linear(13, 4, out_key="acton"), None, 2)
 

@@ -100,6 +100,7 @@ class AnyDrone(DroneRandomization):
                 self.middle = layout.replace(**changes, max_thrust_to_weight=drawn["thrust_to_weight"][0])
             except ValueError as error:
                 raise UserValueError(f"{source}: the drones that any may draw are not all possible: {error}") from error
+        self.nominal = fields
 
     def start(self, random: Randomness, state: State) -> State:
         drawn, fields = self._drone(random.uniform(n := len(state["position"]), len(RANGES)))

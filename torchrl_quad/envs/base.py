@@ -205,7 +205,7 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         fits = all(x.dtype == self.dtype and x.device == self.device for x in params.fields().values())
         params = params if fits else params.to(device=self.device, dtype=self.dtype)
         config.check_flown(self.dynamics, params)
-        config.check_changes(self.dynamics, params, self.disturbances.get("randomize"))
+        config.check_changes(self.dynamics, self.params, params, self.disturbances.get("randomize"))
         self._params = params
 
     def set_initial_state_source(self, source: Callable[[int], TensorDictBase] | None) -> None:

@@ -11,9 +11,11 @@ from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import AfterValidator
+from torch import Tensor
 
 from torchrl_quad.dynamics import DYNAMICS, Dynamics, QuadrotorParams
 from torchrl_quad.dynamics.gains import MAX_SUBSTEPS
+from torchrl_quad.dynamics.parameters import FIELDS
 from torchrl_quad.envs.any_drone import any_drone
 from torchrl_quad.envs.disturbances import Disturbance, DroneRandomization, RandomStart, Sensors, Wind
 from torchrl_quad.envs.scenes import MountedCamera, Scene
@@ -152,20 +154,25 @@ def check_flown(dynamics: Dynamics, params: QuadrotorParams, which: str = "") ->
         raise UserValueError(f"{which}{error}") from None
 
 
-def check_changes(dynamics: Dynamics, params: QuadrotorParams, drawn: Disturbance | None) -> None:
-    """Refuse a drone that is to fly if it differs from the nominal one in nothing that flies, or in what is drawn."""
-    nominal, names = dynamics.nominal, (*params.fields(), *dynamics.nominal.fields())
-    changed = {k for k in names if (params.value(k) != nominal.value(k)).any()}
-    if lost := sorted(changed & set(drawn.spec if isinstance(drawn, DroneRandomization) else ())):
+def check_changes(dynamics: Dynamics, flying: QuadrotorParams, params: QuadrotorParams, drawn: Any) -> None:
+    """Refuse a drone if what it changes of the one that flies is drawn in each episode, or does not count in flight."""
+    changed = {k for k in FIELDS if not _same(params.value(k), flying.value(k))}
+    if lost := sorted(changed & (drawn.nominal.keys() if drawn else set())):
         raise UserValueError(
             f"params: randomize draws {', '.join(lost)} in each episode, so that this would change nothing. Build the "
-            "environment with this drone, or leave that field out of randomize."
+            "environment with this drone and without randomize, or give randomize other ranges."
         )
     if changed and not changed & set(dynamics.plant_fields):
         raise UserValueError(
-            f"params: {', '.join(sorted(changed))} would change nothing here: the flight controller keeps the nominal "
-            "drone. Build the environment with it: HoveringEnv(drone=params)."
+            f"params: {', '.join(sorted(changed))} would change nothing here: in flight only "
+            f"{', '.join(dynamics.plant_fields)} count, and the controller keeps the nominal drone. Build the "
+            "environment with this drone for another controller: HoveringEnv(drone=params)."
         )
+
+
+def _same(x: Tensor, y: Tensor) -> bool:
+    """Whether values of a field are equal; rotor positions with z never equal those without."""
+    return len({1, x.shape[-1], y.shape[-1]}) < 3 and bool(torch.isclose(x, y, rtol=1e-6, atol=0.0).all())
 
 
 def check_forms(model: type) -> None:

@@ -272,6 +272,9 @@ def test_tracks_of_other_projects_are_read_and_what_was_assumed_is_said(tmp_path
     assert (level["gates"][0]["width"], level["frame"], level["closed"]) == (0.4, 0.16, False)
     assert level["position_jitter"] == [0.1, 0.2, 0.0] and level["box"][1] == [2.5, 1.5, 2.0]
     assert level["scene"]["cylinders"][0]["low"] == [0.9, 0.65, 0.0]
+    changes = {"scene": {"ground": True}, "position_jitter": [0.0] * 3, "starts": [[0.0, 0.0, 1.0]] * 2}
+    other = load_track(tmp_path / "level.toml", **changes)  # count instead of what the file says
+    assert {key: other[key] for key in changes} == changes
     (tmp_path / "any.toml").write_text(LSY.replace("false", "true"))
     drawn = load_track(tmp_path / "any.toml", random={"gates": 4})
     for track in (drawn, tmp_path / "level.toml"):

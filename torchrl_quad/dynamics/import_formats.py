@@ -179,7 +179,7 @@ def _flightmare(said: Said) -> Found:
         found["thrust_map"] = [most / speed**2, 0.0, 0.0], "from thrust_max at motor_omega_max, as the square of speed"
     elif curve is not None and most is not None and speed is not None and speed_at(most, curve) < speed:
         found["rotor_speed_max"] = speed_at(most, curve), "at thrust_max, before motor_omega_max"
-    if None not in map(said.data.get, ("quad_drag_coeffs", "cross_sections")):
+    if all(said.data.get(x) is not None for x in ("quad_drag_coeffs", "cross_sections")):
         square = 0.5 * 1.225 * said("quad_drag_coeffs", 3) * said("cross_sections", 3)
         found["quadratic_drag"] = square, "of quad_drag_coeffs and cross_sections, in air"
     if (gravity := said("gravity", *[3] * isinstance(said.data.get("gravity"), list))) is not None:
@@ -271,7 +271,7 @@ def _rotorpy(said: Said) -> Found:
     found |= placed(places)
     if all(x is not None for x in moments[:3]):
         found |= diagonal(symmetric(*(x or 0.0 for x in moments)))
-    if None not in map(said.data.get, drag):
+    if all(said.data.get(x) is not None for x in drag):
         each = np.array([said(x) for x in drag])
         found["quadratic_drag"] = each, "of each axis by itself; in RotorPy times the whole speed"
     if k2 is not None:

@@ -114,7 +114,7 @@ def time_optimal(source: str, values: dict[str, Any]) -> dict[str, Any]:
     closed = bool(values.get("ring", False)) or lap is not None
     notes = [f"the gates repeat: a lap of {lap}"] if lap else ["a ring" if closed else "no lap: end is the last gate"]
     if start := (values.get("initial") or {}).get("position"):
-        own["start"] = as_array(start).tolist()
+        own.setdefault("start", as_array(start).tolist())
     return {"closed": closed, **own, "gates": points[:lap], "notes": [*notes, "only positions of the ends are read"]}
 
 
@@ -133,7 +133,7 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
         )
     box = values.get("box") or [limits["pos_limit_low"], limits["pos_limit_high"]]
     box = as_array(box).tolist()
-    own = {key: x for key, x in values.items() if key not in ("controller", "deploy", "sim", "env", "axis")}
+    given = {key: x for key, x in values.items() if key not in ("controller", "deploy", "sim", "env", "axis")}
     order = track.get("gate_order") or [*range(1, len(centres) + 1)]
     gates = [abs(x) - 1 for x in order]
     if any(x not in range(len(centres)) for x in gates):
@@ -145,8 +145,8 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
     axis = values.get("axis") or ("x" if of_today else None)
     axis = _axis(source, axis, start, centres, rotations, False, LSY_FRAMES)
     rotations, size = multiply(rotations, AXES[axis]), track.get("gate_size") or {}
-    own = {"width": size.get("width", LSY_OPENING), "height": size.get("height", LSY_OPENING), **own}
-    own = {"frame": LSY_FRAMES[axis], "closed": False, "box": box, "start_range": 0.05, **own}
+    own = {"width": size.get("width", LSY_OPENING), "height": size.get("height", LSY_OPENING)}
+    own |= {"frame": LSY_FRAMES[axis], "closed": False, "box": box, "start_range": 0.05, **given}
     notes = [
         f"gates are flown along their {axis} axis",
         f"they are open {shown(own['width'])} x {shown(own['height'])} m, with frames of {shown(own['frame'])} m",
@@ -176,7 +176,8 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
     if "gate_rpy" in drawn:  # about the file's axes
         roll, pitch, yaw = drawn["gate_rpy"][1].tolist()
         own["rotation_jitter"] = [roll, pitch, yaw] if axis == "x" else [pitch, roll, yaw]
-    own["starts"] = [[*start[:2], max(start[2], box[0][2] + 0.25)], *before[1:]]
+    if "gates" not in given:
+        own["starts"] = [[*start[:2], max(start[2], box[0][2] + 0.25)], *before[1:]]
     notes.append("poles are 0.03 m thick, and end at their position")
     tops = as_array([pole["pos"] for pole in track.get("obstacles", [])]).reshape(-1, 3)
     middle, spread = drawn.get("obstacle_pos", (np.zeros(3), np.zeros(3)))
@@ -185,7 +186,7 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
     for pole, z, least, most in zip(poles, tops[:, 2] + middle[2], low, high, strict=True):
         ends = {"count": 1, "low": least, "high": most, "height": [float(z - spread[2]), float(z + spread[2])]}
         pole |= ends if spread.any() else {"base": least}
-    return {**own, "scene": {"cylinders": poles}} if poles else own
+    return {**own, **({"scene": {"cylinders": poles}} if poles else {}), **given}
 
 
 def isaac_drone_racer(source: str, values: dict[str, Any], gates: list[Mapping[str, Any]]) -> dict[str, Any]:

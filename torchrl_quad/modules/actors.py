@@ -86,7 +86,8 @@ def make_actor(
         if not num_cells:
             raise UserValueError("A memory reads the first hidden layer: give num_cells at least one, such as [64].")
         features = Features(None, network_of(env, in_keys, num_cells[0], [], activation, input_scale), activation())
-        return _composed(env, "make_actor", features, in_keys, hidden_size, num_cells[1:], activation, *head)
+        more = {"num_cells": list(num_cells[1:]), "activation_class": activation}
+        return _composed(env, "make_actor", features, in_keys, hidden_size, more, *head)
     options = num_cells, activation, input_scale
     return _policy(env, "make_actor", [], in_keys, lambda size: network_of(env, in_keys, size, *options), *head)
 
@@ -160,42 +161,26 @@ def make_visual_actor(
     ).to(image.dtype)
     seen = convolutions(image.zero()).shape[-1]
     trunk = network_of(env, in_keys, num_cells[0], [], activation, input_scale, more=seen)
-    features, head = Features(convolutions, trunk, activation()), (action_init, scale_init, learn_scale)
-    keys, size = [image_key, *in_keys], hidden_size if recurrent else 0
-    head = *head, noise_correlation, return_log_prob
-    return _composed(env, "make_visual_actor", features, keys, size, num_cells[1:], activation, *head)
+    features, keys = Features(convolutions, trunk, activation()), [image_key, *in_keys]
+    more = {"num_cells": list(num_cells[1:]), "activation_class": activation}
+    head = action_init, scale_init, learn_scale, noise_correlation, return_log_prob
+    return _composed(env, "make_visual_actor", features, keys, hidden_size if recurrent else 0, more, *head)
 
 
 def _composed(
-    env: EnvBase,
-    name: str,
-    features: Features,
-    in_keys: Sequence[NestedKey],
-    hidden_size: int,
-    num_cells: Sequence[int],
-    activation: Any,
-    *head: Any,
+    env: EnvBase, name: str, features: Features, in_keys: Sequence[NestedKey], hidden_size: int, more: Any, *head: Any
 ) -> TanhGaussianActor:
     """A policy of features, a memory if it has a size, further layers, and a head, as :func:`_policy` takes it."""
-    dtype = next(features.parameters()).dtype
-    width = cast(nn.Linear, features.trunk.mlp[-1]).out_features
+    width, dtype = cast(nn.Linear, features.trunk.mlp[-1]).out_features, next(features.parameters()).dtype
     parts: list[Any] = [TensorDictModule(features, in_keys=list(in_keys), out_keys=["features"])]
-    widths = [width]
+    widths = [width, hidden_size] if hidden_size else [width]
     if hidden_size:
-        memory = GRUModule(
-            input_size=width,
-            hidden_size=hidden_size,
-            python_based=True,
-            device=env.device,
-            in_keys=["features", MEMORY],
-            out_keys=["recalled", ("next", MEMORY)],
-        ).to(dtype)
-        parts.append(memory)
-        widths.append(hidden_size)
+        keys: Any = {"in_keys": ["features", MEMORY], "out_keys": ["recalled", ("next", MEMORY)]}
+        memory = GRUModule(width, hidden_size, python_based=True, device=env.device, **keys)
+        parts.append(memory.to(dtype))
 
     def last(size: int) -> Network:
-        mlp = MLP(sum(widths), size, num_cells=list(num_cells), activation_class=activation, device=env.device)
-        return Network(mlp.to(dtype), [1.0] * len(widths), widths)
+        return Network(MLP(sum(widths), size, device=env.device, **more).to(dtype), [1.0] * len(widths), widths)
 
     return _policy(env, name, parts, ["features", "recalled"][: len(widths)], last, *head)
 

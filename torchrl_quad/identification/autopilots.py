@@ -383,23 +383,25 @@ def read_dataflash(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
         else:
             starts.setdefault(kind, array("Q")).append(at + 3)
         at += size
-    streams, parameters, tables, ends = {}, {}, {}, np.zeros(len(boots) + 1)
+    streams, parameters, tables, spans = {}, {}, {}, np.tile([np.inf, -np.inf], (len(boots) + 1, 1))
     for kind, places in starts.items():
         message, letters, fields, record = kinds[kind]
         rows = pick(data, places, record)
         if message == "PARM" and {"Name", "Value"} <= set(fields):
             names = (x.decode(errors="ignore") for x in rows["Name"])
             parameters |= dict(zip(names, rows["Value"].tolist(), strict=True))
-        columns = {
-            field: numbers(rows[field]) * _SCALES.get(letter, 1.0)
-            for field, letter in zip(fields, letters, strict=True)
-            if letter not in "nNZa"
-        }
+        scales = {x: _SCALES.get(y, 1.0) for x, y in zip(fields, letters, strict=True) if y not in "nNZa"}
+        columns = {x: numbers(rows[x]) * scale for x, scale in scales.items()}
         if "TimeUS" in columns:
             tables[message] = np.searchsorted(boots, places), columns
-            np.maximum.at(ends, tables[message][0], columns["TimeUS"] + 1e7)
-    for boot, columns in tables.values():  # whose clock begins anew with each boot
-        columns["TimeUS"] += (np.cumsum(ends) - ends)[boot]
+            np.minimum.at(spans[:, 0], tables[message][0], columns["TimeUS"])
+            np.maximum.at(spans[:, 1], tables[message][0], columns["TimeUS"])
+    last, shifts = -np.inf, [0.0]
+    for first, end in spans:  # a boot sets the clock back; what describes messages again need not be one
+        shifts.append(shifts[-1] + (last + 1e7 if first + 1e6 < last else 0.0))
+        last = end if end > -np.inf else last
+    for boot, columns in tables.values():
+        columns["TimeUS"] += np.array(shifts[1:])[boot]
     for message, (_, columns) in tables.items():
         time = columns["TimeUS"]
         which = next((columns[x] for x in ("I", "C", "Inst", "Instance") if x in columns), np.zeros(len(time)))
@@ -415,8 +417,8 @@ def read_dataflash(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
     if not streams:
         raise UnreadableLog(f"{name} is not a readable dataflash log: it holds no message with a time. Copy it again.")
     notes = [f"the dataflash log is damaged: {lost} bytes were not read"] if lost else []
-    flown = np.count_nonzero(ends)
-    notes += [f"the log holds {flown} boots: they follow one another, 10 s apart"] if flown > 1 else []
+    if (flown := len(set(shifts))) > 1:
+        notes.append(f"the log holds {flown} boots: they follow one another, 10 s apart")
     if "RCOU" in streams:
         streams["RCOU"] = _with_signals(streams["RCOU"], parameters, name, notes)
     return list(streams.values()), notes

@@ -1,6 +1,6 @@
 """Stop a motor of an octorotor at a random time, and train a policy with a memory to land in spite of it.
 
-After 131 s of processor time it prints: 100 % land, 0 % crash, tilt mostly below 14 degrees, of 256 flights."""
+After two to three minutes it prints: 100 % land, 0 % crash, tilt mostly below 13 degrees, of 256 flights."""
 
 import torch
 from torch.nn.functional import one_hot

@@ -36,11 +36,11 @@ _DOWN: Remedy = {  # the quaternion times (0, 1, 0, 0)
     "factor": (-1.0, 1.0, 1.0, -1.0),
     "when": "the body of the attitude has y right and z down",
 }
+_BACKWARD = {"when": "x of the attitude's body points backward"}
 BACKWARD: list[Remedy] = [  # the quaternion times (0, 0, 0, 1), or yaw by half a turn
-    {"quantity": "quaternion", "order": (3, 2, 1, 0), "factor": (-1.0, 1.0, -1.0, 1.0)},
-    {"quantity": "euler", "factor": (-1.0, -1.0, 1.0), "offset": (0.0, 0.0, np.pi)},
+    {"quantity": "quaternion", "order": (3, 2, 1, 0), "factor": (-1.0, 1.0, -1.0, 1.0), **_BACKWARD},
+    {"quantity": "euler", "factor": (-1.0, -1.0, 1.0), "offset": (0.0, 0.0, np.pi), **_BACKWARD},
 ]
-BACKWARD = [{**x, "when": "x of the attitude's body points backward"} for x in BACKWARD]
 _EULER: list[Remedy] = [  # angles as in aviation, beside positions with z up
     {"quantity": "euler", "factor": (1.0, -1.0, -1.0), "when": "the angles are of a body with y right and z down"},
 ]

@@ -344,6 +344,10 @@ def test_what_a_drone_says_and_another_setting_overrides_is_told():
     assert torch.equal(anyone.params.quadratic_drag, effective.params.quadratic_drag)
     assert effective.params.rotor_effectiveness is not None
     assert HoveringEnv(num_envs=1, drone=worn).rebuilt(drone="crazyflie_brushless").params.mass.item() > 0.04
+    worn = HoveringEnv(num_envs=1, drone=worn, dtype=torch.float64)
+    worn.params = worn.nominal
+    again = worn.rebuilt(seed=1)
+    assert again.params is again.nominal
     with pytest.warns(DroneWarning, match="this drone has no drag, so wind does not move it"):
         HoveringEnv(num_envs=1, drone="kingfisher", wind={"gust": 1.0})
 

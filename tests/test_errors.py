@@ -12,6 +12,7 @@ from torchrl.envs.transforms import Compose, ExcludeTransform, ObservationNorm, 
 from torchrl_quad import HoveringEnv, HybridLoss, LandingEnv, SHACLoss, load_drone, make_env
 from torchrl_quad.data import differentiable_rollout, restart
 from torchrl_quad.envs import Event
+from torchrl_quad.envs.disturbances import Disturbance
 from torchrl_quad.modules import make_actor, make_value
 from torchrl_quad.objectives.calls import holding
 from torchrl_quad.training.launch import Refused, _explained
@@ -144,14 +145,28 @@ def test_an_action_of_another_shape_or_kind_is_refused_and_not_broadcast(action,
         refuses(f"The action {message}", env.rollout, 2, policy, break_when_any_done=break_when_any_done)
 
 
+class Heavier(Disturbance):
+    def start(self, random, state):
+        return {("drone", "mass"): torch.full_like(state["position"][:, :1], 2.0)}
+
+
 def test_parameters_and_policies_that_do_not_fit_are_refused(env):
     with pytest.raises(TypeError, match="params must be QuadrotorParams, such as env.params.replace.*; got str"):
         env.params = "visfly"
     with pytest.raises(ValueError, match="rate_gain would change nothing here: .* the controller keeps the nominal"):
         env.params = env.params.replace(rate_gain=[10.0] * 3)
     drawn = HoveringEnv(num_envs=4, randomize={"mass": {"scale": [0.8, 1.2]}})
-    with pytest.raises(ValueError, match="randomize draws mass in each episode, .* give randomize other ranges"):
+    with pytest.raises(ValueError, match="randomize draws mass in each episode, .* change what randomize draws"):
         drawn.params = drawn.params.replace(mass=0.5)
+    with pytest.raises(ValueError, match="Heavier draws mass .* have no gradient. .* without Heavier, or change what"):
+        HoveringEnv(num_envs=4, disturbances=Heavier).set_params(drawn.params.replace(mass=0.5))
+    for field, message in (
+        ("mass", "randomize draws mass .* no gradient"),
+        ("rate_gain", "No gradient reaches it: detach"),
+    ):
+        learned = drawn.params.replace(**{field: drawn.params.value(field).clone().requires_grad_()})
+        refuses(message, drawn.set_params, learned)
+        refuses(message, HoveringEnv, num_envs=4, drone=learned, randomize={"mass": {"scale": [0.8, 1.2]}})
     any_drone = HoveringEnv(num_envs=4, control="rotor_thrusts", randomize="any")
     with pytest.raises(ValueError, match="randomize draws motor_time_constant in each episode"):
         any_drone.params = any_drone.params.replace(motor_time_constant=0.04)

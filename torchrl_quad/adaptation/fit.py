@@ -100,6 +100,8 @@ class Flown(Disturbance):
     ``air`` (6), from which the wind follows.
     """
 
+    follows_params = True
+
     def __init__(self, prior: QuadrotorParams) -> None:
         nothing = torch.zeros(len(_PRIOR))
         self.fit = FlightFit(prior, nothing, torch.diag(nothing), (0.0, 0.0), {}, {}, {}, 0.0)

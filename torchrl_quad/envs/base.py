@@ -169,7 +169,8 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
                 f"{', '.join(self.dynamics.sizes)}. What the environment adds, such as step, comes after it."
             ) from error
         state = sample_state(self, num_envs)
-        check_task(self, state)
+        self._starts = check_task(self, state)
+        config.check_changes(self.dynamics, self.params, self.params, self._starts)
         self._connect(state)
         for name, spec in self.control_step.specs().items():
             setattr(self, name, spec)
@@ -205,7 +206,7 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         fits = all(x.dtype == self.dtype and x.device == self.device for x in params.fields().values())
         params = params if fits else params.to(device=self.device, dtype=self.dtype)
         config.check_flown(self.dynamics, params)
-        config.check_changes(self.dynamics, self.params, params, self.disturbances.get("randomize"))
+        config.check_changes(self.dynamics, self.params, params, self._starts)
         self._params = params
 
     def set_initial_state_source(self, source: Callable[[int], TensorDictBase] | None) -> None:
@@ -281,8 +282,9 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         same drone, if none is given, from its own starts."""
         now = {"compile": self._stepper.options or self.is_compiled, "device": self.device}
         env = cast(Any, type(self))(**{**self._built_with, **now, **changes})
-        if self.params is not self.nominal and "drone" not in changes:
-            env.set_params(self.params)
+        flying = env.nominal if self.params is self.nominal else self.params
+        if "drone" not in changes and flying is not env.params:
+            env.set_params(flying)
         return env
 
     def _place(self, drone: QuadrotorParams) -> None:

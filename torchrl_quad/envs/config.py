@@ -154,19 +154,27 @@ def check_flown(dynamics: Dynamics, params: QuadrotorParams, which: str = "") ->
         raise UserValueError(f"{which}{error}") from None
 
 
-def check_changes(dynamics: Dynamics, flying: QuadrotorParams, params: QuadrotorParams, drawn: Any) -> None:
-    """Refuse a drone if what it changes of the one that flies is drawn in each episode, or does not count in flight."""
-    changed = {k for k in FIELDS if not _same(params.value(k), flying.value(k))}
-    if lost := sorted(changed & (drawn.nominal.keys() if drawn else set())):
+def check_changes(
+    dynamics: Dynamics, flying: QuadrotorParams, params: QuadrotorParams, starts: Mapping[Any, Disturbance]
+) -> None:
+    """Refuse a drone if what it changes of the one that flies, or a gradient, is lost: a disturbance, by the entries
+    that ``starts`` gives for it, draws that in each episode, or it does not count in flight."""
+    learned, plant = {k for k, x in params.fields().items() if x.requires_grad}, set(dynamics.plant_fields)
+    changed = learned | {k for k in FIELDS if not _same(params.value(k), flying.value(k))}
+    drawn = {key[1]: x for key, x in starts.items() if key[0] == "drone" and not x.follows_params}
+    if lost := sorted(changed & drawn.keys()):
+        by = drawn[lost[0]]
+        who = "randomize" if isinstance(by, DroneRandomization) else type(by).__name__
         raise UserValueError(
-            f"params: randomize draws {', '.join(lost)} in each episode, so that this would change nothing. Build the "
-            "environment with this drone and without randomize, or give randomize other ranges."
+            f"params: {who} draws {', '.join(lost)} in each episode, so that this would change nothing, and have no "
+            f"gradient. Build the environment with this drone and without {who}, or change what {who} draws."
         )
-    if changed and not changed & set(dynamics.plant_fields):
+    if idle := learned - plant or (set() if changed & plant else changed):
+        mend = "Build the environment with this drone for another controller: HoveringEnv(drone=params)."
         raise UserValueError(
-            f"params: {', '.join(sorted(changed))} would change nothing here: in flight only "
-            f"{', '.join(dynamics.plant_fields)} count, and the controller keeps the nominal drone. Build the "
-            "environment with this drone for another controller: HoveringEnv(drone=params)."
+            f"params: {', '.join(sorted(idle))} would change nothing here: in flight only "
+            f"{', '.join(dynamics.plant_fields)} count, and the controller keeps the nominal drone. "
+            + ("No gradient reaches it: detach it." if learned & idle else mend)
         )
 
 

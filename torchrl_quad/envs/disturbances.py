@@ -41,6 +41,7 @@ class Disturbance:
     """
 
     privileged: Mapping[str | tuple[str, str], float] = {}  #: as of a task
+    follows_params = False  #: whether its entries ("drone", field) are those of ``env.params``, which may then change
 
     @property
     def noise_size(self) -> int:

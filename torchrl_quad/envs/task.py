@@ -208,8 +208,8 @@ class Task(abc.ABC):
         return self.randomness.integers(high, *shape)
 
 
-def check_task(env: Task, state: State) -> None:
-    """Check that the methods of a task return what :class:`Task` says."""
+def check_task(env: Task, state: State) -> dict[Key, Disturbance]:
+    """Check that the methods of a task return what :class:`Task` says; return who starts which entry of the state."""
     task, n = type(env).__name__, env.num_envs
 
     def check(condition: bool, message: str) -> None:
@@ -257,7 +257,7 @@ def check_task(env: Task, state: State) -> None:
         mend = "Draw from self.uniform, and count nothing."
         check(again, f"initial_state: {key!r} differs between calls with one seed. {mend}")
     taken = {"step", "action_queue", "collided", "drone", "scene"}
-    starts = {key: type(x).__name__ for x in env.disturbances.values() for key in x.start(env.randomness, state)}
+    starts = {key: x for x in env.disturbances.values() for key in x.start(env.randomness, state)}
     taken |= {key for key in starts if isinstance(key, str)}
     for key in env.task_entries:
         own = f"initial_state: entry {key!r} is the environment's own; give yours another name."
@@ -265,7 +265,8 @@ def check_task(env: Task, state: State) -> None:
     fields, kinds = env.dynamics.plant_fields, (env.dtype, torch.int64, torch.bool)
     check_changes(env, state)
     for key, x in state.items():
-        entry = f"initial_state: entry {key!r}" + (f", from {starts[key]}.start," if key in starts else "")
+        who = f", from {type(starts[key]).__name__}.start," if key in starts else ""
+        entry = f"initial_state: entry {key!r}{who}"
         check(
             isinstance(x, Tensor) and x.dim() > 1 and len(x) == n and x.dtype in kinds,
             f"{entry} must be a tensor ({n}, ...) of at least two dimensions, {env.dtype}, int64 or bool; got "
@@ -316,6 +317,7 @@ def check_task(env: Task, state: State) -> None:
         got, wanted = _kind(advanced.get(key)), _kind(state[key])
         whole = f"advance must return the whole state, and {key!r} as initial_state gives it, ({wanted}); got ({got})."
         check(got == wanted, f"{whole} Start from {{**state, ...}}.")
+    return starts
 
 
 def check_changes(env: Task, state: State) -> None:

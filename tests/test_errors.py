@@ -101,6 +101,18 @@ def test_a_bad_value_is_refused_by_name(kwargs, message):
         "initial_state: 'legs' differs between calls with one seed. Draw from self.uniform"),
     ("initial_state", lambda env, n: env.hover_state(torch.zeros(n, 3))["step"],
         "initial_state asks for 'step', which hover_state does not give: it has position, "),
+    ("initial_state", lambda _, n: None, "initial_state must return the state that hover_state .*; got NoneType"),
+    ("initial_state", lambda _, n: {"goal": torch.zeros(n, 3)}, "must return the state that hover_state .*; got goal"),
+    ("initial_state", adding(legs=torch.full((4, 1), torch.nan)), "'legs' is not finite. Look for a quotient"),
+    ("initial_state", adding(position=torch.full((4, 3), 1e7)), "no drone can fly .*'position' must be finite and bet"),
+    ("state_bounds", lambda _: {"target": (2.0, 3.0)}, r"no drone can fly .*: 'target' must lie between 2.0 and 3.0"),
+    ("state_bounds", lambda _: {"goal": (2.0, 3.0)}, r"state_bounds must give entries .*; got 'goal': \(2.0, 3.0\)"),
+    ("observation_bounds", lambda _: torch.zeros(13), r"observation_bounds must be a tensor \(k,\) above zero"),
+    ("state_bounds", lambda _: {"target": 2.0}, r"state_bounds must give entries .*; got 'target': 2.0"),
+    ("reward_terms", lambda _, s: {"near": torch.log(0.0 * s["position"][:, :1])}, r"\['near'\] is not finite at"),
+    ("is_success", lambda _, s: s["position"][:, 2] > 1.0, r"must be a tensor \(4, 1\), .* Keep the last dimension"),
+    ("metrics", lambda _, s: {"crash": s["position"][:, :1]}, r"metrics\(state\): every task has crash already"),
+    ("weights", {**HoveringEnv.weights, "spin": 0.1}, "weights: no reward term reads spin. Write self.weights"),
     ("initial_state", adding(legs=torch.zeros(4, 1).int()), r"'legs' must be .* int64 or bool; got .* torch.int32\)"),
 )  # fmt: skip
 def test_a_task_of_another_form_is_refused_by_the_name_of_its_method(method, wrong, message):

@@ -40,6 +40,25 @@ def test_one_line_makes_a_task_known_to_make_env_and_to_gymnasium():
     assert type(make_env("own_task.CornerEnv", num_envs=2)) is CornerEnv  # without any name
 
 
+class LateEnv(CornerEnv):
+    def __init__(self, num_envs=8, **kwargs):
+        self.corner = self.tensor([1.0, 1.0, 1.0])
+        super().__init__(num_envs, **kwargs)
+
+
+class LaterEnv(LateEnv):
+    def __init__(self, num_envs=8, *, speed=1.0, **kwargs):
+        QuadrotorEnv.__init__(self, num_envs, **kwargs)
+        self.reach = speed
+
+
+@pytest.mark.parametrize("task", [LateEnv, LaterEnv])
+def test_what_is_set_too_early_or_too_late_comes_with_a_note_of_the_order(task):
+    with pytest.raises(AttributeError, match="no attribute '(randomness|reach)'") as refused:
+        task()
+    assert "set what they read before it, and make tensors in set_up" in refused.value.__notes__[0]
+
+
 class UnfinishedEnv(QuadrotorEnv):
     def observe(self, state):
         return state["position"]

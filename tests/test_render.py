@@ -32,7 +32,7 @@ class Climbing(HoveringEnv):
         return state["position"]
 
     def reward_terms(self, state):
-        return {"climb": state["velocity"][:, 2:]}
+        return {"climb": self.weights["climb"] * state["velocity"][:, 2:]}
 
     def is_crash(self, state):
         return state["position"][:, 2:] <= 0

@@ -39,7 +39,13 @@ class _Build(type(EnvBase)):
             )
         given = dict(zip(inspect.signature(cls).parameters, args, strict=False))
         kwargs = {name: x for name, x in cls.defaults.items() if name not in given} | kwargs
-        env = super().__call__(*args, **kwargs)
+        try:
+            env = super().__call__(*args, **kwargs)
+        except AttributeError as error:
+            if str(error).startswith(f"{cls.__name__!r} object"):
+                when = "super().__init__() calls set_up and initial_state: set what they read before it"
+                error.add_note(f"{when}, and make tensors in set_up, as self.tensor works from there on.")
+            raise
         env._built_with = given | kwargs
         return env
 
@@ -162,16 +168,24 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         self.randomness.seed(seed)
         self.set_up()
         try:
-            self.task_entries = [key for key in self.initial_state(num_envs) if key not in self.dynamics.sizes]
+            start = self.initial_state(num_envs)
         except KeyError as error:
             raise UserValueError(
                 f"{type(self).__name__}.initial_state asks for {error}, which hover_state does not give: it has "
                 f"{', '.join(self.dynamics.sizes)}. What the environment adds, such as step, comes after it."
             ) from error
+        if not (isinstance(start, Mapping) and start.keys() >= self.dynamics.sizes.keys()):
+            got = ", ".join(map(str, start)) if isinstance(start, Mapping) else type(start).__name__
+            raise UserValueError(
+                f"{type(self).__name__}.initial_state must return the state that hover_state gives, and your entries: "
+                f"{{**self.hover_state(position), 'goal': goal}}; got {got}."
+            )
+        self.task_entries = [key for key in start if key not in self.dynamics.sizes]
         state = sample_state(self, num_envs)
         self._starts = check_task(self, state)
         config.check_changes(self.dynamics, self.params, self.params, self._starts)
         self._connect(state)
+        self.control_step.restore(TensorDict(cast(Any, nested(state))), f"{type(self).__name__}.initial_state")
         for name, spec in self.control_step.specs().items():
             setattr(self, name, spec)
         self.set_seed(seed)

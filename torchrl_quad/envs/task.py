@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import numbers
+from collections import UserDict
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, cast
 
@@ -222,10 +223,12 @@ def check_task(env: Task, state: State) -> dict[Key, Disturbance]:
         if isinstance(x, numbers.Real):
             kind_of = ", dtype=torch.bool" if dtype == torch.bool else ""
             hint = f" Write torch.full_like(state['position'][:, :1], {x}{kind_of})." if columns else ""
-        elif method.startswith("reward") and isinstance(x, Tensor):
+        elif columns and isinstance(x, Tensor) and not is_right:
             hint = " Keep the last dimension: norm(x) of envs.terms, or .sum(-1, keepdim=True)."
         hint = " Convert it: .to(self.dtype)." if is_right and dtype == env.dtype else hint
         check(is_right and dtype in (None, x.dtype), f"{method} must be a tensor {wanted}; got {_kind(x)}.{hint}")
+        broken = f"{method} is not finite at the start. Look for a quotient, a root or a logarithm near zero."
+        check(not method.startswith(("observe", "reward")) or bool(x.isfinite().all()), broken)
 
     def call(name: str, *states: State) -> Any:
         """What a method returns of states, into which it must not write: the physics goes on from them."""
@@ -272,6 +275,7 @@ def check_task(env: Task, state: State) -> dict[Key, Disturbance]:
             f"{entry} must be a tensor ({n}, ...) of at least two dimensions, {env.dtype}, int64 or bool; got "
             f"({_kind(x)}).",
         )
+        check(bool(x.isfinite().all()), f"{entry} is not finite. Look for a quotient, a root or a logarithm near zero.")
         if size := env.dynamics.sizes.get(key):
             check(x.shape == (n, size), f"{entry} must have shape {(n, size)}, got {tuple(x.shape)}.")
         if isinstance(key, tuple) and key[0] == "drone" and key[1] not in fields:
@@ -283,6 +287,21 @@ def check_task(env: Task, state: State) -> dict[Key, Disturbance]:
             shape = (n, *one.shape[-env.nominal.dim(key[1]) :])
             fits = x.shape == shape or key[1] == "motor_time_constant"  # which may be two
             check(fits, f"{entry} must have shape {shape}, got {tuple(x.shape)}.")
+    for key, bounds in env.state_bounds().items():
+        is_right = key in state and isinstance(bounds, tuple | list) and len(bounds) == 2
+        pairs = "state_bounds must give entries of the state their least and greatest value, {'goal': (-5.0, 5.0)}"
+        check(is_right, f"{pairs}; got {key!r}: {bounds!r}.")
+    clip = env.observation_bounds()
+    is_right = clip is None or (isinstance(clip, Tensor) and clip.dim() == 1 and bool((clip > 0.0).all()))
+    check(is_right, f"observation_bounds must be a tensor (k,) above zero, or None; got {clip}.")
+    weights, read = env.weights, set()
+
+    class Read(UserDict):
+        def __getitem__(self, key: str) -> Any:
+            read.add(key)
+            return super().__getitem__(key)
+
+    env.weights = Read(weights)
     check_tensor("observe(state)", call("observe", state), env.dtype, None)
     terms, metrics, events = call("reward_terms", state), call("metrics", state), call("events", state, state)
     for method, term in named("reward_terms(state)", terms):
@@ -299,6 +318,8 @@ def check_task(env: Task, state: State) -> dict[Key, Disturbance]:
         check(is_term, f"{method}.term must be one of {', '.join(terms)}, or None; got {event.term!r}.")
     for method, metric in named("metrics(state)", metrics):
         check_tensor(method, metric, env.dtype)
+    clash = ", ".join(EPISODE_METRICS.keys() & metrics.keys())
+    check(not clash, f"metrics(state): every task has {clash} already; give yours another name.")
     missing = sorted(env.metric_info.keys() - EPISODE_METRICS.keys() - metrics.keys())
     adds_some = type(env).episode_metrics is not Task.episode_metrics  # which may give what metrics() lacks
     check(adds_some or not missing, f"metrics(state) lacks {', '.join(missing)}, which metric_info describes.")
@@ -308,7 +329,11 @@ def check_task(env: Task, state: State) -> dict[Key, Disturbance]:
         check(is_right, f"privileged {hint}; got {key!r}: {factor!r}. The state has: {', '.join(map(str, state))}.")
     for method in ("is_crash", "is_success"):
         check_tensor(f"{method}(state)", call(method, state), torch.bool)
-    advanced = call("advance", state, state)
+    advanced, env.weights = call("advance", state, state), weights
+    usual = type(env).weights
+    mine = {k for k in weights if k in vars(type(env)).get("weights", ()) or weights[k] != usual.get(k)}
+    lost = "" if "weights" in type(env).set_up.__code__.co_names else ", ".join(sorted(mine - read))
+    check(not lost, f"weights: no reward term reads {lost}. Write self.weights[...] there, or leave it out of weights.")
     named("advance(previous, state)", advanced)
     for key in advanced:
         lost = f"advance gives {key!r}, which the state lacks and would lose. Give it in initial_state, too."

@@ -165,6 +165,13 @@ class CrashedEnv(HoveringEnv):
         return torch.ones_like(state["step"], dtype=torch.bool)
 
 
+class DetachedEnv(HoveringEnv):
+    def reward_terms(self, state):
+        return super().reward_terms({**state, "velocity": state["velocity"].detach()}) | {
+            "attitude": 0.0 * state["position"][:, :1]
+        }
+
+
 class SparseEnv(HoveringEnv):
     """Paid for arriving alone; two of six starts crash at once."""
 
@@ -210,6 +217,7 @@ NO_ATTITUDE = {"attitude": 0.0}
     (DoubtfulEnv, {"near": 10.0, "width": 0.08}, "'near' is flat in .* of the flights, those in which it pays least"),
     (HoveringEnv, {"survival": 0.0, **NO_ATTITUDE}, "as this policy flies .* must cost more than [0-9.]*, else dying"),
     (CrashedEnv, {}, "100% of the episodes end in their first step: look at the start, is_crash and is_success"),
+    (DetachedEnv, {}, "'velocity' changes from step to step without a gradient: no numpy"),
     (HoveringEnv, {}, "'attitude' is less than a thousandth of return and gradient"),
 )
 def test_the_audit_says_in_words_what_keeps_a_policy_from_learning_a_task(task, weights, trap):

@@ -160,6 +160,15 @@ def test_a_run_that_solves_nothing_says_what_may_be_the_reason(train, tmp_path, 
     assert starts == ["as this policy fli", "all episodes end a"] and len(said) == 2
 
 
+def test_a_task_of_your_own_is_audited_before_it_trains_which_changes_nothing(train, tmp_path, monkeypatch):
+    said, own = [], [*EVERYTHING, "task._target_=own_task.CornerEnv", "env.max_episode_steps=6"]
+    monkeypatch.setattr(torchrl_logger, "warning", said.append)
+    audited = train("abpt", tmp_path / "audited", *own)
+    assert said[0].startswith("Before training, own_task.CornerEnv may have a trap: as this policy flies a step pays -")
+    monkeypatch.setattr(loop.Run, "_traps", lambda _: [])
+    assert_equal(train("abpt", tmp_path / "plain", *own), audited)
+
+
 def test_an_update_that_is_not_finite_is_left_out_and_counted(train, tmp_path, monkeypatch):
     said = []
     monkeypatch.setattr(torchrl_logger, "warning", said.append)

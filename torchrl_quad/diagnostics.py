@@ -196,6 +196,8 @@ def audit_reward(
     for name, x in audit.items():
         if x.verdict == "not finite":
             traps.append(f"the gradient of {name!r} is not finite: clamp the arguments of roots, quotients and acos")
+        if x.verdict == "no gradient" and 2 * len(terms[name].unique()) > terms[name].numel():  # and no bonus
+            traps.append(f"{name!r} changes from step to step without a gradient: no numpy, .detach() or .item() in it")
         if x.verdict == "differentiable":
             traps += _flat(name, terms[name], returns[name], grads[name][len(sources) :])
             if max(x.return_share, x.gradient_share) < 1e-3:

@@ -157,6 +157,9 @@ class Run:
             self._warm_up()
             if rank() == 0:
                 print(f"Compiled in {time.perf_counter() - began:.0f} s.", flush=True)
+        if rank() == self.steps == 0 and not type(self.task).__module__.startswith("torchrl_quad."):
+            for trap in self._traps():
+                torchrl_logger.warning(f"Before training, {self.cfg.task} may have a trap: {trap}.")
         way = "inside" if self.task.flies_inside(self.actor) else "before"
         name = f"{self.cfg.algorithm} {self.cfg.task} {self.cfg.seed}, policy {way} the step"
         often = 0.1 if sys.stderr.isatty() else 30.0  # [s]: a file or a cluster's log keeps every line
@@ -321,16 +324,19 @@ class Run:
 
     def _warn(self, crash: float) -> None:
         """Say why a run that has solved nothing may never learn: the traps of the reward, and the time limit."""
+        seconds = self.task.max_episode_steps * self.task.control_dt
+        limit = f"all episodes end after {seconds:.3g} s: if drones still come nearer then, set max_episode_steps"
+        for trap in [*self._traps(), limit] if crash < 0.05 else self._traps():
+            torchrl_logger.warning(f"Nothing is solved after {self.steps:,} steps. Perhaps {trap}.")
+
+    def _traps(self) -> Sequence[str]:
+        """What the audit of the next horizon's reward says; change nothing."""
         with torch.random.fork_rng(), drawing_from(self.env, self.cfg.eval.seed):
             rollout, _ = differentiable_rollout(self.env, self.actor, self.carry, self.horizon)
             try:
-                traps = audit_reward(rollout, self.actor, gamma=self.cfg.gamma).traps
+                return audit_reward(rollout, self.actor, gamma=self.cfg.gamma).traps
             except UserError as error:
-                traps = [str(error)]
-        seconds = self.task.max_episode_steps * self.task.control_dt
-        limit = f"all episodes end after {seconds:.3g} s: if drones still come nearer then, set max_episode_steps"
-        for trap in [*traps, limit] if crash < 0.05 else traps:
-            torchrl_logger.warning(f"Nothing is solved after {self.steps:,} steps. Perhaps {trap}.")
+                return [str(error)]
 
     def _diagnose(self) -> dict[str, float]:
         """Measure what reward and gradient of the next horizon are made of; change nothing."""

@@ -122,7 +122,7 @@ def fly(task, horizon=24, **options):
     ("landing", {}, ["success", "crash"], []),
     ("racing", {"reward": "position"}, ["gate"], ["'attitude'"]),
     ("racing", {"reward": "velocity"}, ["gate"], []),
-    ("racing", {"gate_bonus": "log"}, [], ["gate,", "as"]),  # it falls at each gate, and steps pay less than nothing
+    ("racing", {"gate_bonus": "log"}, [], ["gate,"]),
     ("racing", {"reward": "velocity", "gate_bonus": "reciprocal"}, [], ["gate,"]),
 )
 def test_the_audit_finds_which_rewards_are_fully_and_which_are_partially_differentiable(task, options, without, traps):

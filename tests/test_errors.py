@@ -112,7 +112,6 @@ def test_a_bad_value_is_refused_by_name(kwargs, message):
     ("reward_terms", lambda _, s: {"near": torch.log(0.0 * s["position"][:, :1])}, r"\['near'\] is not finite at"),
     ("is_success", lambda _, s: s["position"][:, 2] > 1.0, r"must be a tensor \(4, 1\), .* Keep the last dimension"),
     ("metrics", lambda _, s: {"crash": s["position"][:, :1]}, r"metrics\(state\): every task has crash already"),
-    ("weights", {**HoveringEnv.weights, "spin": 0.1}, "weights: no reward term reads spin. Write self.weights"),
     ("initial_state", adding(legs=torch.zeros(4, 1).int()), r"'legs' must be .* int64 or bool; got .* torch.int32\)"),
 )  # fmt: skip
 def test_a_task_of_another_form_is_refused_by_the_name_of_its_method(method, wrong, message):

@@ -244,9 +244,11 @@ def _ending(reward: Tensor, ends: Mapping[str, Tensor], collided: Tensor, steps:
     terminated, success, crash = (ends.get(name, never) for name in ("terminated", "success", "crash"))
     won = terminated & success & ~crash
     died = terminated & ~won
-    usual = reward[~terminated].mean().item()
+    alive = reward[~terminated]
+    usual = alive.mean().item()
     cost = reward[died].mean().item() if died.any() else 0.0
-    if ("crash" in ends or died.any()) and usual < 0.0 and cost > steps * usual:
+    losing = (alive < 0.0).double().mean().item() > 0.9  # else a policy soon finds steps that pay
+    if ("crash" in ends or died.any()) and losing and cost > steps * usual:
         cheap = f"must cost more than {-steps * usual:.3g}, else dying is"
         cheap = f"pays {cost:.3g}: dying is" if died.any() else cheap
         yield (

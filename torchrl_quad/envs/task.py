@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import abc
 import numbers
-from collections import UserDict
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, cast
 
@@ -294,14 +293,6 @@ def check_task(env: Task, state: State) -> dict[Key, Disturbance]:
     clip = env.observation_bounds()
     is_right = clip is None or (isinstance(clip, Tensor) and clip.dim() == 1 and bool((clip > 0.0).all()))
     check(is_right, f"observation_bounds must be a tensor (k,) above zero, or None; got {clip}.")
-    weights, read = env.weights, set()
-
-    class Read(UserDict):
-        def __getitem__(self, key: str) -> Any:
-            read.add(key)
-            return super().__getitem__(key)
-
-    env.weights = Read(weights)
     check_tensor("observe(state)", call("observe", state), env.dtype, None)
     terms, metrics, events = call("reward_terms", state), call("metrics", state), call("events", state, state)
     for method, term in named("reward_terms(state)", terms):
@@ -329,11 +320,7 @@ def check_task(env: Task, state: State) -> dict[Key, Disturbance]:
         check(is_right, f"privileged {hint}; got {key!r}: {factor!r}. The state has: {', '.join(map(str, state))}.")
     for method in ("is_crash", "is_success"):
         check_tensor(f"{method}(state)", call(method, state), torch.bool)
-    advanced, env.weights = call("advance", state, state), weights
-    usual = type(env).weights
-    mine = {k for k in weights if k in vars(type(env)).get("weights", ()) or weights[k] != usual.get(k)}
-    lost = "" if "weights" in type(env).set_up.__code__.co_names else ", ".join(sorted(mine - read))
-    check(not lost, f"weights: no reward term reads {lost}. Write self.weights[...] there, or leave it out of weights.")
+    advanced = call("advance", state, state)
     named("advance(previous, state)", advanced)
     for key in advanced:
         lost = f"advance gives {key!r}, which the state lacks and would lose. Give it in initial_state, too."

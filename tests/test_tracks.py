@@ -324,6 +324,7 @@ def test_tracks_of_other_projects_are_read_and_what_was_assumed_is_said(tmp_path
 AGILE = {"start_pos": [-5, 0, 2], "goal_pos": [8, 0, 2]}
 UPRIGHT = {"rotation": [1, 0, 0, 0]}
 ROW = {"Gate1": {"position": [0, 0, 2], **UPRIGHT}, "Gate2": {"position": [8, 0, 2], **UPRIGHT}}
+LYING = [{"position": [x, 0, 2], "rotation": [0, 0, 0.6, 0.8], "radius": 1} for x in (0, 8)]  # x, y, z, w
 SQUARE = {"position": [0, 0, 2], "yaw": 0.0, **OPEN}
 
 
@@ -339,6 +340,8 @@ SQUARE = {"position": [0, 0, 2], "yaw": 0.0, **OPEN}
     ({"gates": {"first": [0, 0, 1]}}, {}, "its gates have names, .* of no format that is known"),
     ({"gates": [[0, 0, 1], SQUARE]}, {}, "gates must be all points, or all mappings"),
     ({"gates": [SQUARE, {**SQUARE, "rotation": [1, 0, 0, 0]}]}, {}, "gate 2: give a yaw, .* or a rotation"),
+    ({"gates": LYING}, {}, "lie or lean if rotations are w, x, y, z, and all .* x, y, z, w. Write w first"),
+    ({**AGILE, "gates": dict(zip(ROW, LYING, strict=True))}, {"radius": 1, "axis": "x"}, "Write w first"),
     ({"quadrotor_config": {}}, {}, "unknown key .quadrotor_config.. Allowed: gates.* help of load_track lists"),
     ({"gates": [SQUARE, {**SQUARE, "wide": 1}]}, {}, "gate 2: unknown key 'wide'. Allowed: position, yaw"),
     ({"gates": [[0, 0, 1], [1, 1, 1]], "frame": 0.1}, {}, "frame is of gates with a direction; these are points"),

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchrl_quad.dynamics import presets, quaternion
-from torchrl_quad.envs.track_files import flown_track, own_format, posed
+from torchrl_quad.envs.track_files import check_order, flown_track, own_format, posed
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.options import Seed, accepted, between, build, check_value, checked, entries
 from torchrl_quad.rotations import from_euler
@@ -329,6 +329,7 @@ def _directed(source: str, raw: Sequence[Any], shape: Mapping[str, Any], has_rad
     raw = [{k: x.tolist() if isinstance(x, Tensor | np.ndarray) else x for k, x in gate.items()} for gate in raw]
     own = [gate if set(gate) & set(_OPENING) else {**gate, **shape} for gate in raw]
     gates = [build(Gate, f"{source}: gate {i}", gate).entries() for i, gate in enumerate(own, 1)]
+    check_order(source, [gate["rotation"] for gate in gates])
     if len({"radius" in gate for gate in gates}) > 1:
         raise UserValueError(f"{source}: all gates have a width and a height, or all have a radius.")
     return gates

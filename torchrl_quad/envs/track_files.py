@@ -69,6 +69,7 @@ def agile_flight(source: str, values: dict[str, Any], gates: list[Mapping[str, A
         raise UserValueError(f"{source}: does not say {missing[0]}. Give load_track(..., {missing[0]}=[x, y, z]).")
     start, goal = as_array(values["start_pos"]), as_array(values["goal_pos"])
     is_lap = np.linalg.norm(goal - centres[0]) < np.linalg.norm(goal - centres[-1])
+    check_order(source, rotations)
     axis = _axis(source, values.get("axis"), start, centres, rotations, is_lap)
     notes = [
         f"gates are flown along their {axis} axis",
@@ -247,6 +248,16 @@ def flown_track(path: Path) -> dict[str, Any]:
         raise UserValueError(f"{path}: the drone passed {len(order)} gates, and no lap twice. Give a longer flight.")
     notes = [f"a lap of {lap} gates, flown {len(order) / lap:.1f} times", "openings lie between the inner corners"]
     return {"gates": order[:lap], "closed": True, "notes": [*notes, "gates stand where they were seen in the median"]}
+
+
+def check_order(source: str, rotations: Any) -> None:
+    """Refuse rotations (k, 4) of gates that all stand upright as x, y, z, w, and lie or lean as w, x, y, z."""
+    a, b, c, d = np.square(rotations).T  # up.z is 1 of a gate that stands upright
+    if (c + d - a - b > 0.999).all() and (a + d - b - c < 0.9).any():
+        raise UserValueError(
+            f"{source}: its gates lie or lean if rotations are w, x, y, z, and all stand upright if they are x, y, z, "
+            "w. Write w first."
+        )
 
 
 def posed(centres: Any, rotations: Any) -> list[dict[str, Any]]:

@@ -4,6 +4,7 @@ import json
 import re
 import runpy
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from refusals import cases, refuses
 
 from torchrl_quad import HoveringEnv, load_drone
 from torchrl_quad.dynamics import import_drone
+from torchrl_quad.errors import DroneWarning
 
 MOTOR = {"timeConstantUp": 0.0125, "timeConstantDown": 0.025, "maxRotVelocity": 1000, "momentConstant": 0.02}
 MOTOR |= {"motorConstant": 1e-5, "rotorDragCoefficient": 1e-4}
@@ -185,14 +187,15 @@ HOVER, FAST = np.sqrt(9.81 * 2 / 4 / 1e-5), 2 * np.pi / 60  # of a rotor of the 
 def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_given(file, text, given, wanted, tmp_path):
     path, unread, wanted = tmp_path / file, wanted.get("unread", ""), {k: x for k, x in wanted.items() if k != "unread"}
     path.write_text(text)
-    drone = load_drone(path, torch.float64, **given)
+    page = import_drone(path, **given)
+    with pytest.warns(DroneWarning, match="; not read: ") if "# Not read: " in page else nullcontext():
+        drone = load_drone(path, torch.float64, **given)
     for name, value in wanted.items():
         np.testing.assert_allclose(getattr(drone, name).squeeze(), np.asarray(value, float), rtol=1e-5, err_msg=name)
     written = tmp_path / "ours.yaml"
-    written.write_text(import_drone(path, **given))
+    written.write_text(page)
     for name, value in load_drone(written, torch.float64).fields().items():
         torch.testing.assert_close(value, getattr(drone, name), rtol=1e-6, atol=1e-12)
-    page = written.read_text()
     assert page.startswith(f"# Source: {file}") and "chosen here: suggest_gains" in page
     assert all(f"{x}: " in page and "given, not in the file" in page for x in given if x != "entry")
     assert unread in page
@@ -283,6 +286,9 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_given(
     ("x.json", '{"k_eta": 1, "k_eta": 2}', "not JSON that can be read: .*k_eta.* has a name twice"),
     ("x.json", json.dumps({**L2F, "J_inv": np.eye(3).tolist()}), "inertia .* J_inv is not the inverse of J"),
     ("x.yaml", json.dumps(VISFLY | {"motor_omega_min": None, "thrust_map": [4e-7, -1e-5, 0]}), "rotor_speed_min=13.8"),
+    ("x.yaml", FLIGHTMARE.replace("mass:", "rotors_config: plus, mass:"), "rotor_spin .1.: rotors_config is 'plus'"),
+    ("x.yaml", json.dumps(OMNI | {"rotor_configuration": OMNI["rotor_configuration"] | {"tilt_angles": [0.3] * 4}}),
+        "time_constant .*rotor_direction .1.: tilt_angles do not say .*; not read: drag_coef, tau of rotor_conf"),
     ("x.yaml", "{mass: 1, inertia: [1, 1, 1], T_bm: [0, 0, 1]}", "this file is of no kind that is known"),
     ("x.sdf", sdf(FRAME + motors() + TILTING), "the joint 'tilt' turns the rotor 'rotor_0', and rotors here are fixed"),
 )  # fmt: skip
@@ -403,7 +409,8 @@ def test_the_recipe_writes_a_drone_from_a_model_and_what_it_includes(tmp_path, m
     with pytest.raises(SystemExit):
         runpy.run_path(str(script), run_name="__main__")
     advice = re.search(r"load_drone\(.*\)(?=, or)", capsys.readouterr().err)[0]
-    assert HoveringEnv(num_envs=1, drone=eval(advice)).nominal.mass.item() == 2.0
+    with pytest.warns(DroneWarning, match="not read: velocity_decay/linear"):
+        assert HoveringEnv(num_envs=1, drone=eval(advice)).nominal.mass.item() == 2.0
     (tmp_path / "x.toml").write_text(TOML)
     with pytest.raises(ValueError, match="entry='b', linear_drag=") as refused:
         load_drone(tmp_path / "x.toml", entry="b")

@@ -184,10 +184,13 @@ def _flightmare(said: Said) -> Found:
         found["quadratic_drag"] = square, "of quad_drag_coeffs and cross_sections, in air"
     if (gravity := said("gravity", *[3] * isinstance(said.data.get("gravity"), list))) is not None:
         found["gravity"] = np.linalg.norm(gravity), ""
+    said.unread.pop("rotors_config", None)
     places = [said(f"tbm_{where}", 3) for where in ("fr", "bl", "br", "fl")]
     if all(x is not None for x in places):
         found |= placed(np.stack(places), note="front right, back left, back right, front left")
         found["rotor_spin"] = [-1, -1, 1, 1], "of Agilicious's allocation, not in the file"
+    elif (config := said.data.get("rotors_config", "cross")) != "cross":
+        found |= dict.fromkeys(("rotor_positions", "rotor_spin"), (None, f"rotors_config is {shown(config)}"))
     elif arm is not None:
         corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
         found |= placed(arm * math.sqrt(0.5) * corners, note="the arm at 45 degrees")
@@ -302,6 +305,8 @@ def _by_angles(said: Said) -> Found:
         found |= diagonal(symmetric(*(moments(axes) for axes in AXES)))
     if angle is not None and arm is not None:
         found |= placed((arm * [np.cos(angle), np.sin(angle), 0.0 * angle]).T.round(9), note="arms at their angles")
+    if (tilt := part("tilt_angles", n)) is not None and tilt.any():
+        found["rotor_direction"] = None, "tilt_angles do not say about which axes"
     if turn is not None:
         found["rotor_spin"] = -turn, "against direction, which is 1 counter-clockwise"
     found["rotor_speed_max"] = same(fastest, "max_rotation_velocities")

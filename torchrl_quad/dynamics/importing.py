@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import textwrap
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from torchrl_quad.dynamics.import_formats import (
 from torchrl_quad.dynamics.import_mjcf import read_mjcf
 from torchrl_quad.dynamics.import_models import read_model, read_tree
 from torchrl_quad.dynamics.parameters import FIELDS, QuadrotorParams, read_drone, read_fields
-from torchrl_quad.errors import UserValueError, one_line, shown
+from torchrl_quad.errors import DroneWarning, UserValueError, one_line, shown
 
 CONVERT = {  # programs that write such files, and how to run them
     ".xacro": "Expand it first: xacro FILE.xacro > FILE.urdf.",
@@ -48,7 +49,7 @@ def load_drone(
     """A preset by its name (:func:`available_drones`), a file by its path, or a mapping of fields to numbers.
 
     Args:
-        drone: the file may be of another project, as in :func:`import_drone`.
+        drone: the file may be of another project, as in :func:`import_drone`. A warning names what is not read of it.
         dtype: of its tensors.
         entry: which drone, of a file that has several.
         **fields: of :class:`QuadrotorParams`, which count instead of those that the drone says.
@@ -60,6 +61,8 @@ def load_drone(
     """
     source, kind, found, unread = _read(drone, entry, fields)
     found = _completed(source, kind, found, fields, unread, entry) if kind else found
+    if unread:
+        warnings.warn(f"{source} ({kind}){_left(unread)}. import_drone shows the rest.", DroneWarning, stacklevel=2)
     return read_drone({k: v for k, (v, _) in found.items()} | fields, dtype, source)
 
 
@@ -104,6 +107,10 @@ def import_drone(path: str | Path, *, entry: str | None = None, **fields: Any) -
     return "\n".join(lines) + "\n"
 
 
+def _left(unread: Sequence[str]) -> str:
+    return f"; not read: {one_line(', '.join(unread))}" if unread else ""
+
+
 def _flow(value: Array) -> str:
     return f"{value:.7g}" if value.ndim == 0 else f"[{', '.join(f'{x:.7g}' for x in value)}]"
 
@@ -126,8 +133,8 @@ def _completed(
         like = ", ".join(f"{x}={y}" for x, y in examples.items() if x in missing and x not in follow)
         like = f"entry={entry!r}, {like}" if entry is not None else like
         raise UserValueError(
-            f"{source} ({kind}) does not say {names}. Give your own numbers, in SI units and our frame, such as "
-            f"load_drone({source!r}, {like}), or the same as arguments of recipes/import_drone.py."
+            f"{source} ({kind}) does not say {names}{_left(unread)}. Give your own numbers, in SI units and our frame, "
+            f"such as load_drone({source!r}, {like}), or the same as arguments of recipes/import_drone.py."
         )
     drags = [one_line(x) for x in unread if re.search("drag|aero", x) and "linear" not in x]
     ours = {

@@ -134,7 +134,7 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
     "motors in counts": (lambda t: scaled(t, MOTORS, 65535.0), "WrongUnit", "counts of 16 bits, write"),
     "motors beyond full": (lambda t: scaled(t, MOTORS, 2.0), "WrongUnit", "full command. It is like neither"),
     "motors are thrusts": (lambda t: scaled(t, MOTORS, 2.75), "WrongUnit", "put sqrt.thrust / full thrust. in"),
-    "motors hardly run": (lambda t: scaled(t, MOTORS, 0.03), "WrongUnit", "no drone flies with so little"),
+    "thrusts below one": (lambda t: scaled(t, MOTORS, 0.08), "WrongUnit", "flies with so little.*put sqrt.thrust /"),
     "motors turn to and fro": (lambda t: {n: 65535 * 700 * np.sin(9 * t["t"] + t[n]) for n in MOTORS}, "WrongUnit",
         "like neither"),
     "motors are speeds": (lambda t: {n: 65535 * 3e-2 * (-1) ** k * t[n] for k, n in enumerate(MOTORS)}, "WrongUnit",
@@ -174,7 +174,7 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
 }  # fmt: skip
 
 
-HOPELESS = {"motors beyond full", "motors are thrusts", "motors hardly run", "motors turn to and fro", "no numbers"}
+HOPELESS = {"motors beyond full", "motors are thrusts", "thrusts below one", "motors turn to and fro", "no numbers"}
 HOPELESS |= {"one motor stands", "clock jumps back", "no order in time", "y up", "motors off", "never in the air"}
 HOPELESS |= {"world turned", "world mirrored", "attitude of another time"}
 

@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from torchrl_quad.identification import Columns, LogError, read_log
 from torchrl_quad.identification.layouts import choose
+from torchrl_quad.identification.motor_checks import check_motors
+from torchrl_quad.identification.signals import Signal
 
 T = np.arange(0.0, END, 0.01)
 TRUE = flight(T)
@@ -38,6 +40,8 @@ FAULTS = {  # what changes, how it is named, and what the message says
         "turned by 46 degrees about .0.0, 0.0, 1.0. a"),
     "tracker pitched": (own_table(T, quaternion=turned((0, 0.5, 0))), TABLE, "turned by 29 degrees about .-?0.0, 1.0"),
     "tracker backward": (own_table(T, quaternion=turned((0, 0, np.pi))), NO_GYRO, "back right on, or x .*f x of"),
+    "motors a quarter on": (own_table(T, motor_command=TRUE["motor_command"][:, [3, 0, 1, 2]]), NO_GYRO,
+        "front right on, or x of .*points left, and must point forward. If motors are"),
     "backward angles": (own_table(T) | euler(BACKWARD.as_euler("ZYX")[:, ::-1]), EULER, "180 degrees .*backward, wr"),
     "aviation": (own_table(T, **aviation) | euler(np.degrees(AVIATION.as_euler("ZYX")[:, ::-1])), EULER,
         "in degrees and .* yaw counts from north"),
@@ -59,7 +63,8 @@ FAULTS = {  # what changes, how it is named, and what the message says
         "names a column twice: u0, u1"),
 }  # fmt: skip
 
-MENDED = ("tracker backward", "backward angles", "aviation", "feet", "half speed", "minutes", "samples")
+MENDED = ("tracker backward", "motors a quarter on", "backward angles", "aviation", "feet", "half speed", "minutes")
+MENDED += ("samples",)
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -73,6 +78,12 @@ def test_what_contradicts_the_rest_of_a_log_is_named_and_what_is_to_be_written_m
         for name in ("position", "velocity", "acceleration"):
             np.testing.assert_allclose(getattr(log, name)[5:-5], flight(log.time)[name][5:-5], atol=5e-3)
         np.testing.assert_allclose(matrix(log.quaternion), matrix(flight(log.time)["quaternion"]), atol=2e-3)
+
+
+def test_commands_whose_columns_are_named_thrusts_say_what_to_do_if_they_are():
+    signal = Signal("motor_command", ("thrust1", "thrust2", "thrust3", "thrust4"), T, TRUE["motor_command"])
+    assert "0 to 1. If they are thrusts, put sqrt" in check_motors(signal)[0]
+    assert check_motors(replace(signal, columns=("m1", "m2", "m3", "m4"))) == []
 
 
 def test_rows_that_a_tracker_lost_count_as_missing(tmp_path):

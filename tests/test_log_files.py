@@ -121,6 +121,9 @@ def test_the_parameters_of_a_ulog_say_which_outputs_are_motors_and_which_drones_
     charge = messages["battery_status"][0], {"voltage_v": ("float", 0.0 * messages["battery_status"][0])}
     messages |= {"battery_status": charge, "battery_status#1": messages["battery_status"]}
     same(read_log(write_ulog(path, messages, limits | functions | {k: float(v) for k, v in PLACES.items()})))
+    of_old = np.concatenate((gimbal[:, 1:3], pulses[:, [3, 1, 0, 2]], still[:, :2]), 1)  # without functions of outputs
+    old = {name: x for name, x in messages.items() if name != "actuator_outputs#1"}
+    same(read_log(write_ulog(path, old | {"actuator_outputs": (t, {"output": ("float", of_old)})}, limits)))
     asleep = messages | {"actuator_armed": (t, {"armed": ("uint8_t", 0.0 * t)})}
     asleep["actuator_outputs#1"] = (t, {"output": ("float", 0.0 * still + 900.0)})
     twelve = messages | {"actuator_motors": (t, {"control": ("float", np.tile(signal, 3))})}

@@ -24,7 +24,7 @@ from torchrl_quad.airframe import quarters
 from torchrl_quad.deploy.frames import motor_signal
 from torchrl_quad.errors import shown
 from torchrl_quad.identification.errors import NoFlight, UnreadableLog, WrongMotors
-from torchrl_quad.identification.signals import MAX_COLUMNS, Array, Stream
+from torchrl_quad.identification.signals import MAX_COLUMNS, Array, Stream, numbers
 
 _SYNC = bytes.fromhex("2f731320250cbb12")
 _KINDS = frozenset(b"BFIMPQARDLCSO")
@@ -132,8 +132,14 @@ def _add_signals(streams: dict[str, Stream], parameters: Mapping[str, float]) ->
                     signals[f"{stem}.signal[{k}]"] = motor_signal(np.nan_to_num(numbers(control)), curve)
     elif outputs:
         ports = {parameters.get(f"PWM_{p}_FUNC{n}"): (p, n) for p in ("AUX", "MAIN") for n in range(16, 0, -1)}
-        places = [ports.get(101 + motor, ("MAIN", motor + 1)) for motor in order]
-        of = {x: [streams[x].columns.get(f"{x}.output[{n - 1}]", np.zeros(1)) for _, n in places] for x in outputs}
+        of, places = {}, {}
+        for x in outputs:  # without functions, motors are the four that begin at rest, as no gimbal does, or the first
+            each = [streams[x].columns.get(f"{x}.output[{n}]", np.zeros(1)) for n in range(16)]
+            begin = {n: y[0] for n, y in enumerate(each, 1) if np.ptp(y) > 0.0}
+            idle = [n for n, y in begin.items() if y == min(begin.values())]
+            main = idle if len(idle) == 4 else (1, 2, 3, 4)
+            places[x] = [ports.get(101 + motor, ("MAIN", main[motor])) for motor in order]
+            of[x] = [each[n - 1] for _, n in places[x]]
         stem = max(outputs, key=lambda x: sorted(np.std(np.nan_to_num(y)) for y in of[x]))  # gimbals do not move four
         pulses = {k: x for k, x in enumerate(of[stem]) if len(x) == len(streams[stem].time)}
         reached = np.concatenate([*pulses.values(), np.zeros(1)])
@@ -146,7 +152,7 @@ def _add_signals(streams: dict[str, Stream], parameters: Mapping[str, float]) ->
             why = f"{stem} runs from {least:g} to {most:g}: no pulses in us"
             raise WrongMotors(f"{why}. Write the commands, 0 to 1, into a CSV, and give that.")
         for k, x in pulses.items():
-            port, n = places[k]
+            port, n = places[stem][k]
             names = [[f"PWM_{port}_{end}{n}", f"PWM_{port}_{end}", f"PWM_{end}"] for end in ("MIN", "MAX")]
             given = [[v for name in some if (v := parameters.get(name, -1.0)) > 0.0] for some in names]
             low, high = ([*x, at][0] for x, at in zip(given, (1000.0, 2000.0), strict=True))
@@ -321,12 +327,6 @@ def unpacked(columns: Mapping[str, Array]) -> dict[str, Array]:
 def _text(body: bytes, at: int) -> tuple[str, int]:
     end = body.index(b"\0", at)
     return body[at:end].decode(), end + 1
-
-
-def numbers(raw: NDArray[Any]) -> Array:
-    """A column in float64."""
-    with np.errstate(invalid="ignore"):  # NaN of some patterns warn
-        return raw.astype(float)
 
 
 def pick(data: bytes, starts: array, record: np.dtype) -> NDArray[np.void]:

@@ -214,8 +214,8 @@ def check_rates(
                 {"quantity": "quaternion", **_QUATERNIONS[best]},
             )
         if best == "in the world frame":
-            also = f", or the body of the attitude {apart}" if turned > fits[best][0] - SURE else ""
-            drop = {"quantity": signal.field, "drop": True}
+            also = f", or the body of the attitude {apart}: turn it back" if turned > fits[best][0] - SURE else ""
+            drop = {"quantity": signal.field, "drop": True, "when": "the gyro is in the world frame" if also else ""}
             raise WrongFrame(f"{told} if the gyro is in the world frame{also}.", *(BACKWARD if also else []), drop)
         flip = {"quantity": signal.field, "factor": tuple(signs[best])}
         raise WrongFrame(f"{told} {best}.", *([_NED, *_EULER] if signs[best] is FRD else []), flip)

@@ -280,7 +280,7 @@ def _grid(signals: Mapping[str, Signal], main: Sequence[Signal], dt: float | Non
     step = dt or max(round(attitude.step, 5), LEAST_STEP)
     if not 0.0 < attitude.step < 0.5:
         units = in_units("time", "it is in", milliseconds=1e-3, microseconds=1e-6, nanoseconds=1e-9)
-        counts = {f"at {hertz} Hz": 1.0 / hertz for hertz in (50, 100, 200, 250, 400, 500) if attitude.step == 1.0}
+        counts = {f"at {hertz} Hz": 1.0 / hertz for hertz in (100, 50, 200, 250, 400, 500) if attitude.step == 1.0}
         units = in_units("time", "it counts samples", **counts) + units
         raise WrongUnit(f"{name}: the clock steps by {attitude.step:.4g} s, which is not a flight.", *units)
     start, stop = max(s.time[0] for s in main), min(s.time[-1] for s in main)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -13,7 +14,7 @@ from torchrl_quad.identification.errors import WrongMotors, WrongUnit
 from torchrl_quad.identification.pieces import OFF
 from torchrl_quad.identification.signals import Array, Signal, convolved, slope, smooth
 
-LEAST_HOVER = 0.05  # of the full command: a drone of which this is more than hovering lifts itself a hundred times
+LEAST_HOVER = 0.1  # of the full command: a drone of which this is more than hovering lifts itself ten times or more
 _THRUSTS = ". If they are thrusts, put sqrt(thrust / full thrust) into the file instead, and leave battery_voltage out"
 _COMMANDS = (  # factor, offset, least, largest, and what they are
     (0.01, 0.0, 0.0, 101.0, "percents"),
@@ -26,6 +27,7 @@ _COMMANDS = (  # factor, offset, least, largest, and what they are
 _X = np.array([[1, 1, -1, -1], [-1, 1, 1, -1], [1, -1, 1, -1]])  # roll, pitch, yaw by our motors, yaw either way
 _PLUS = np.array([[0, 1, 0, -1], [-1, 0, 1, 0], [1, -1, 1, -1]])  # of rotors in front, left, behind and right
 _ORDERS = list(itertools.permutations(range(4)))
+_CORNERS = ("front left", "back left", "back right", "front right")
 
 
 def check_motors(signal: Signal) -> list[str]:
@@ -39,14 +41,16 @@ def check_motors(signal: Signal) -> list[str]:
         if OFF < full < LEAST_HOVER:
             raise WrongUnit(
                 f"{signal} reaches {high:.3g} at most, and must run from 0 to 1, the full command: no drone flies with "
-                "so little of it. Name the commands, or say by Columns(names, scale=...) what is full."
+                f"so little of it. Name the commands, or say by Columns(names, scale=...) what is full{_THRUSTS}."
             )
-        return [f"{signal} reaches {low:.3f} to {high:.3f}: clipped to 0 to 1"] if low < 0.0 or high > 1.0 else []
+        clipped = [f"{signal} reaches {low:.3f} to {high:.3f}: clipped to 0 to 1"] if low < 0.0 or high > 1.0 else []
+        thrusts = re.search("thrust|force|newton", " ".join(signal.columns).lower())  # their course does not tell
+        return clipped + ([f"{signal} count as commands, 0 to 1{_THRUSTS}"] if thrusts else [])
     begun = float(signal.values.min(where=signal.values > 0.0, initial=high))  # some are 0 until they are armed
     remedies = [
         {"quantity": signal.field, "factor": factor, "offset": offset, "when": f"they are {what}"}
         for factor, offset, least, most, what in _COMMANDS
-        if least <= (begun if low == 0.0 else low) and high <= most and (full - offset) * factor > 4.0 * LEAST_HOVER
+        if least <= (begun if low == 0.0 else low) and high <= most and (full - offset) * factor > 2.0 * LEAST_HOVER
     ]
     if _turn_one_way(signal.values) and np.abs(signal.values).max() > 50.0:
         remedies.append({"quantity": signal.field, "name": "rotor_speed", "when": "they are rotor speeds in rad/s"})
@@ -88,8 +92,7 @@ def check_order(
     if turns and not spread.any():
         raise WrongMotors(f"In flight {signal} never changes. Name the commands of the motors.")
     if spread.max() > 0.01 and (alike or spread.min() < 1e-3 * spread.max()):
-        place = ("front left", "back left", "back right", "front right")[int(spread.argmin())]
-        which = "are the same for all motors" if alike else f"do not change for the motor {place}"
+        which = "are the same for all motors" if alike else f"do not change for the motor {_CORNERS[spread.argmin()]}"
         raise WrongMotors(f"In flight {signal} {which}. Name the commands of all four.")
 
     def worth_of(signs: Array, late: int = 0) -> Array:
@@ -114,14 +117,16 @@ def check_order(
             late = 1000.0 * dt * shifts[int(apart[:, 0].argmax())]
             when = f"{abs(late):.0f} ms {'late' if late > 0.0 else 'early'}"
             return f"the order of the motors fits how the drone turns if its rates are {when}"
-        back = _ORDERS[best] == (2, 3, 0, 1) and "angular_velocity" not in signals
-        said = ". Motors are named from the back right on, or x of the attitude's body points backward"
+        turn = _ORDERS[best][0] if "angular_velocity" not in signals else 0  # by how many quarters, if it is a turn
+        turn *= _ORDERS[best] == tuple((turn + k) % 4 for k in range(4))
+        named = f"motors are named from the {_CORNERS[-turn]} on"
+        points = f"x of the attitude's body points {('', 'left', 'backward', 'right')[turn]}, and must point forward"
         raise WrongMotors(
             f"{signal} explain how the drone turns less in the order front left, back left, back right, front right "
             f"(correlations about roll, pitch and yaw add up to {worth[0, 0]:.2f}) than in another "
-            f"({worth[0, best]:.2f}){said if back else ''}.",
-            *(BACKWARD if back else []),
-            {"quantity": signal.field, "order": _ORDERS[best]},
+            f"({worth[0, best]:.2f}){f': {named}, or {points}' if turn else ''}.",
+            *(BACKWARD if turn == 2 else []),
+            {"quantity": signal.field, "order": _ORDERS[best], "when": named if turn else ""},
         )
     others = float(np.delete(worth[0], 0).max())
     return (

@@ -8,6 +8,7 @@ import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -198,6 +199,12 @@ def smooth(x: Array, dt: float, span: float = 0.1) -> Array:
 def body_rates(q: Array, dt: float) -> Array:
     """Angular velocity in the body frame (T, 3) [rad/s]: twice the vector part of q^-1 dq/dt."""
     return 2.0 * multiply(conjugate(q), slope(q, dt))[:, 1:]
+
+
+def numbers(raw: NDArray[Any]) -> Array:
+    """A column in float64."""
+    with np.errstate(invalid="ignore"):  # NaN of some patterns warn
+        return raw.astype(float)
 
 
 def convolved(x: Array, kernel: Array) -> Array:

@@ -44,16 +44,6 @@ def test_it_samples_by_default_is_deterministic_on_request_and_resets_the_carry_
     assert not carry["done"].any() and (carry["state", "step"] == 0).all()
 
 
-def test_it_flies_any_differentiable_environment(env):
-    pendulum = PendulumEnv(seed=0)
-    start = pendulum.reset()
-    start["thdot"].requires_grad_()
-    rollout, _ = differentiable_rollout(pendulum, TORQUE, start, 4)
-    assert rollout["next", "reward"].requires_grad
-    with pytest.raises(TypeError, match="actor must be a TensorDictModule that writes the action, got Linear"):
-        differentiable_rollout(env, torch.nn.Linear(13, 4), None, 1)
-
-
 def visited(rollout, *args, **options):
     """A buffer with the states of a rollout."""
     buffer = VisitedStateBuffer(*args, **options)
@@ -115,6 +105,8 @@ def test_resets_inside_a_horizon_start_in_visited_states_too_and_so_do_horizons_
     for carry in (None, start):
         rollout, _ = differentiable_rollout(env, actor, carry, 4)
         assert (rollout["state", "step"][:, [0, 2]] == 2).all()  # after two steps the episode ends, and begins again
+    env.set_initial_state_source(None)
+    assert not env.reset()["state", "step"].any()
 
 
 def test_a_rollout_cut_in_two_by_way_of_the_buffer_equals_the_uncut_one_to_the_last_bit():

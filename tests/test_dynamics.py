@@ -83,20 +83,6 @@ def test_drag_opposes_motion_along_every_axis_and_above_the_centre_of_mass_pitch
     torch.testing.assert_close(angular, about / params.inertia)
 
 
-def test_energy_is_conserved_without_drag_and_lost_with_it():
-    start = body(velocity=vector(3.0, -1.0, 8.0), angular_velocity=vector(2.0, 5.0, -3.0))
-
-    def energy(state, params):
-        kinetic = 0.5 * params.mass * state.velocity.square().sum()
-        rotational = 0.5 * (params.inertia * state.angular_velocity.square()).sum()
-        return kinetic + rotational + params.mass * params.gravity * state.position[0, 2]
-
-    free, dragged = without_drag(), drone()
-    end = fly_body(start, free, NO_WRENCH, 1.0, 1e-3)
-    torch.testing.assert_close(energy(end, free), energy(start, free), rtol=1e-9, atol=0)
-    assert energy(fly_body(start, dragged, NO_WRENCH, 1.0, 1e-3), dragged) < energy(start, dragged) - 0.1
-
-
 def test_torque_free_rotation_conserves_angular_momentum_in_the_world():
     params = without_drag()
     start = body(attitude=quaternion.from_axis_angle(vector(0.3, -0.8, 0.5)), angular_velocity=vector(4.0, 7.0, -2.0))
@@ -159,18 +145,6 @@ def test_allocation_is_r_cross_f_for_any_layout(tilted):
     share = torch.tensor([1.0, 0.5, 0.0, 0.8, 1.2], dtype=F64)
     worn = rigid_body.allocation_matrix(params.replace(rotor_effectiveness=share))
     torch.testing.assert_close(worn @ thrust, rigid_body.allocation_matrix(params) @ (share * thrust))
-
-
-@pytest.mark.parametrize("name", FLOWN)
-def test_a_body_rate_command_turns_the_drone_that_way(name):
-    params = drone(name, drag_height=0.0)  # a drag moment that changes with the speed disturbs the loop
-    controller = FlightController(params)
-    for axis in range(3):
-        stick = 0.5 * torch.eye(3, dtype=F64)[axis : axis + 1]
-        action = controller.hover_action + torch.nn.functional.pad(stick, (1, 0))
-        end = fly(hovering(controller), action, params, controller, 1.0)[-1]
-        wanted = stick * params.max_body_rate
-        torch.testing.assert_close(end.angular_velocity, wanted, atol=0.02 * params.max_body_rate[0].item(), rtol=0.02)
 
 
 @pytest.mark.parametrize("dt", [5e-4, 5e-3, 1e-2])
@@ -398,9 +372,8 @@ def test_with_respect_to_every_parameter_of_the_drone_also_through_resets(limit,
         with torch.no_grad():
             slope = (fly(**{name: value + step}) - fly(**{name: value - step})) / 2.0
         assert slope != 0.0, name
-        torch.testing.assert_close(
-            (grad * step).sum(), slope, rtol=1e-5, atol=0.0, msg=lambda said, name=name: f"{name}: {said}"
-        )
+        say = lambda said, name=name: f"{name}: {said}"  # noqa: E731
+        torch.testing.assert_close((grad * step).sum(), slope, rtol=1e-5, atol=0.0, msg=say)
 
 
 def test_through_a_partial_reset_the_gradient_is_cut_exactly_there():

@@ -128,6 +128,7 @@ def test_drones_of_one_batch_each_have_their_own_controller(control):
     for i, drone in enumerate(drones):
         alone = commanded(10, command[0], control=control, drone=drone)[-1]
         torch.testing.assert_close({key: x[i : i + 1] for key, x in together.items()}, alone)
+    refuses("is for 2 environments, and num_envs=5", HoveringEnv, num_envs=5, drone=type(drones[0])(**both))
 
 
 def test_limits_can_be_chosen_and_gymnasium_takes_them():

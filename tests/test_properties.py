@@ -49,21 +49,17 @@ def flights(draw, calm=True):
     """Drones anywhere, turned, moving and in any step of their episode, and actions; calm ones within the model."""
     motion = numbers if calm else lambda bound, _: wild(bound)
     turned = torch.from_numpy(draw(numbers(1.0, 4))) + 1e-3
-    return {
-        "seed": draw(st.integers(0, 9)),
-        "position": draw(motion(8.0, 3)),
-        "quaternion": turned / turned.norm(dim=-1, keepdim=True),
-        "velocity": draw(motion(20.0, 3)),
-        "angular_velocity": draw(motion(10.0, 3)),
-        "rotors": draw(numbers(1.0, 4)),
-        "queued": draw(numbers(1.0, 4)),
-        "step": draw(arrays("int64", (N, 1), elements=st.integers(0, 10**6 if not calm else 60))),
-        "action": draw(numbers(1.0 if calm else 3.0, 4)),
-    }
+    sizes = {"position": 8.0, "velocity": 20.0, "angular_velocity": 10.0}
+    flight = {"seed": draw(st.integers(0, 9)), **{name: draw(motion(most, 3)) for name, most in sizes.items()}}
+    flight["quaternion"] = turned / turned.norm(dim=-1, keepdim=True)
+    flight |= {name: draw(numbers(1.0, 4)) for name in ("rotors", "queued")}
+    flight["step"] = draw(arrays("int64", (N, 1), elements=st.integers(0, 10**6 if not calm else 60)))
+    return flight | {"action": draw(numbers(1.0 if calm else 3.0, 4))}
 
 
-def start(env, flight):
-    """The flight's state, in a task's own starts, with its action."""
+def start(task, flight, dtype=torch.float64):
+    """The environment, and the flight's state, in a task's own starts, with its action."""
+    env = env_of(task, dtype)
     env.set_seed(flight["seed"])
     state = env.sample_start(N)["state"]
     low, high = env.nominal.rotor_speed_min, env.nominal.rotor_speed_max
@@ -73,7 +69,7 @@ def start(env, flight):
     state["rotor_speed"] = low + (high - low) * (0.5 + 0.5 * values["rotors"])
     state["action_queue"] = values["queued"].unsqueeze(1)
     state["step"] = torch.as_tensor(flight["step"])
-    return TensorDict({"state": state, "action": values["action"]}, [N])
+    return env, TensorDict({"state": state, "action": values["action"]}, [N])
 
 
 def step(env, td):
@@ -98,8 +94,7 @@ def equal(one, other):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @on_each_task(flight=flights(calm=False))
 def test_a_step_from_anywhere_is_finite_and_so_are_its_derivatives(task, dtype, flight):
-    env = env_of(task, dtype)
-    td = start(env, flight)
+    env, td = start(task, flight, dtype)
     inputs = [td["action"], *(x for x in leaves(td["state"]).values() if x.is_floating_point())]
     for x in inputs:
         x.requires_grad_()
@@ -113,8 +108,8 @@ def test_a_step_from_anywhere_is_finite_and_so_are_its_derivatives(task, dtype, 
 
 @on_each_task(flight=flights(calm=False))
 def test_rewards_are_the_sum_of_their_terms_and_flags_agree_and_the_specs_contain_what_is_made(task, flight):
-    env = env_of(task)
-    ends = step(env, start(env, flight))
+    env, td = start(task, flight)
+    ends = step(env, td)
     torch.testing.assert_close(sum(ends["reward_terms"].values()), ends["reward"])
     assert torch.equal(ends["done"], ends["terminated"] | ends["truncated"])
     assert torch.equal(ends["terminated"], ends["crash"] | (ends["success"] & env.ends_on_success))
@@ -127,8 +122,7 @@ def test_rewards_are_the_sum_of_their_terms_and_flags_agree_and_the_specs_contai
 
 @on_each_task(flight=flights(calm=False))
 def test_a_step_is_a_pure_function_of_its_input(task, flight):
-    env = env_of(task)
-    td = start(env, flight)
+    env, td = start(task, flight)
     before = td.clone()
     first = step(env, td)
     env.randomness.seed(99)
@@ -143,8 +137,7 @@ def has_sense(td):
 
 @on_each_task(flight=st.one_of(flights(), flights(calm=False)))
 def test_a_reset_to_a_state_restores_it_to_the_last_bit_or_refuses_it(task, flight):
-    env = env_of(task)
-    td = start(env, flight)
+    env, td = start(task, flight)
     good = has_sense(td)
     assert step(env, td)["crash"][~good].all()
     if not good.all():
@@ -157,8 +150,7 @@ def test_a_reset_to_a_state_restores_it_to_the_last_bit_or_refuses_it(task, flig
 
 @on_each_task(flight=flights())
 def test_two_quaternions_of_one_attitude_fly_alike(task, flight):
-    env = env_of(task)
-    td = start(env, flight)
+    env, td = start(task, flight)
     other = td.clone()
     other["state", "quaternion"] = -td["state", "quaternion"]
     one, two = step(env, td), step(env, other)
@@ -173,8 +165,7 @@ def test_two_quaternions_of_one_attitude_fly_alike(task, flight):
 
 @on_each_task(flight=flights(), order=st.permutations(range(N)))
 def test_the_order_of_the_environments_is_that_of_the_results(task, flight, order):
-    env = env_of(task)
-    td = start(env, flight)
+    env, td = start(task, flight)
     one, two = step(env, td)[list(order)], step(env, td[list(order)])
     torch.testing.assert_close(leaves(one), leaves(two), rtol=1e-12, atol=1e-12)
 
@@ -182,14 +173,13 @@ def test_the_order_of_the_environments_is_that_of_the_results(task, flight, orde
 @search
 @given(flight=flights(), angle=st.floats(-7.0, 7.0))
 def test_a_world_turned_about_its_vertical_turns_the_flight(flight, angle):
-    env = env_of("hovering")
     turn = quaternion.from_axis_angle(torch.tensor([[0.0, 0.0, angle]], dtype=torch.float64))
 
     def turned(state):
         rotated = {key: quaternion.rotate(turn, state[key]) for key in ("position", "velocity")}
         return {**rotated, "quaternion": quaternion.multiply(turn.expand(N, 4), state["quaternion"])}
 
-    td = start(env, flight)
+    env, td = start("hovering", flight)
     other = td.clone()
     other["state"].update(turned(td["state"]))
     td, other = (after(env, x, 3) for x in (td, other))
@@ -214,8 +204,7 @@ def test_body_rates_follow_their_command_and_hardly_exceed_the_limit(flight):
 @search
 @given(flight=flights(calm=False))
 def test_actions_beyond_their_bounds_are_clamped_and_rotors_keep_their_limits(flight):
-    env = env_of("hovering")
-    td = start(env, {**flight, "action": flight["action"] * 10.0})
+    env, td = start("hovering", {**flight, "action": flight["action"] * 10.0})
     clamped = td.clone()
     clamped["action"] = td["action"].clamp(-1.0, 1.0)
     td, clamped = (after(env, x, 10) for x in (td, clamped))
@@ -223,17 +212,3 @@ def test_actions_beyond_their_bounds_are_clamped_and_rotors_keep_their_limits(fl
     speed = td["state", "rotor_speed"]
     assert (speed >= env.nominal.rotor_speed_min * (1 - 1e-12)).all()
     assert (speed <= env.nominal.rotor_speed_max * (1 + 1e-12)).all()
-
-
-@on_each_task(flight=flights())
-def test_the_hover_action_holds_any_place_and_heading(task, flight):
-    env = env_of(task)
-    td = start(env, flight)
-    yaw = torch.as_tensor(flight["queued"])[:, :1] * 4.0
-    state = env.hover_state(td["state", "position"])
-    state["quaternion"] = quaternion.from_axis_angle(torch.cat((0 * yaw, 0 * yaw, yaw), -1))
-    td["state"].update({**state, "action_queue": env.hover_action.expand(N, 1, 4)})
-    td["action"] = env.hover_action.expand(N, 4)
-    td = after(env, td, 10)
-    for key in DRONE:
-        torch.testing.assert_close(td["state", key], state[key], rtol=1e-9, atol=1e-9)

@@ -69,6 +69,16 @@ def test_an_unknown_option_is_refused_with_the_closest_one_and_all_of_them():
     ({"observation_noise": {"delay": 1}}, "observation_noise: unknown key 'delay'"),
     ({"observation_delay": -1}, "observation_delay must be at least 0, got -1. Control steps by which"),
     ({"random_start": {"tilt": float("nan")}}, "random_start: tilt must be a finite number, got nan"),
+    *(({"randomize": drawn}, message) for drawn, message in (
+        ({"weight": {"scale": [0.9, 1.1]}}, "randomize: unknown field 'weight'. Choose from: mass, inertia"),
+        ({"rate_gain": {"scale": [0.9, 1.1]}}, "'rate_gain' belongs to the flight controller, which keeps the nominal"),
+        ({"mass": {"gamma": [1, 2]}}, "mass needs one distribution of: uniform: low and high; scale: .*; normal: "),
+        ({"mass": {"uniform": [-0.1, 1.0]}}, "drones that may be drawn are not all possible: .*'mass' must be between"),
+        ({"mass": {"normal": [0.5, -0.1]}}, "mass needs two numbers, mean and standard deviation"),
+        ({"rotor_spin": {"scale": [-1, 1]}}, "unknown field 'rotor_spin'"),
+        ({"rotor_speed_min": {"uniform": [100, 3000]}, "rotor_speed_max": {"uniform": [2500, 4000]}},
+            "min must be below"),
+        ("none", "Unknown randomize 'none'. Give the path of a .yaml file"))),
 )  # fmt: skip
 def test_a_bad_value_is_refused_by_name(kwargs, message):
     refuses(message, HoveringEnv, **kwargs)
@@ -133,10 +143,8 @@ def test_a_branch_on_data_is_named_by_its_line_and_a_stopped_program_gives_param
 
 
 def test_an_event_whose_term_has_a_name_that_is_taken_is_refused():
-    methods = {
-        "events": lambda _, previous, state: {"near": near(state)},
-        "reward_terms": lambda _, state: {"near_time": state["position"][:, :1]},
-    }
+    methods = {"events": lambda _, previous, state: {"near": near(state)}}
+    methods["reward_terms"] = lambda _, state: {"near_time": state["position"][:, :1]}
     with pytest.raises(ValueError, match="gives the term 'near_time', which the reward has already: rename one"):
         type("OwnEnv", (HoveringEnv,), methods)(num_envs=4)
 
@@ -238,6 +246,8 @@ def test_an_actor_that_reads_what_nobody_writes_is_refused_with_what_there_is(en
 def test_a_carry_is_a_tensordict_of_the_environment(env):
     actor = make_actor(env)
     rollout, carry = differentiable_rollout(env, actor, None, 3)
+    no_actor = "actor must be a TensorDictModule that writes the action, got Linear"
+    refuses(no_actor, differentiable_rollout, env, nn.Linear(13, 4), None, 1, error=TypeError)
     with pytest.raises(TypeError, match="carry must be the tensordict to start from, or None .* got Tensor"):
         differentiable_rollout(env, actor, torch.zeros(4), 2)
     for wrong, size in ((carry[:2], r"\(2,\)"), (rollout, r"\(4, 3\)")):

@@ -148,7 +148,6 @@ def test_an_actor_or_a_carry_of_another_environment_is_refused(env, env64):
     forest = ForestEnv(num_envs=2, density=0.02)
     for other, carry, message in (
         (forest, None, "was built for entries of 13 numbers, and reads some of 9: those"),
-        (env, HoveringEnv(num_envs=2).reset(), r"carry has batch size \(2,\), and the environment \(4,\)"),
         (env, env64.reset(), "'observation' of the carry is torch.float64 on cpu, and that of the env"),
     ):
         refuses(message, differentiable_rollout, other, actor, carry, 1, error=UserValueError)

@@ -17,13 +17,13 @@ import torch
 from refusals import cases, refuses
 from tensordict import assert_close
 from test_bounded_steps import LOSSES
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
+from torch.nn.utils import parameters_to_vector
 from torchrl.collectors import Collector, MultiCollector
 from torchrl.data import Unbounded
 from torchrl.envs import AsyncEnvPool, EnvCreator, ParallelEnv, SerialEnv, check_env_specs
 from torchrl.envs import transforms as of_torchrl
 from torchrl.envs.transforms import Compose, RewardSum, StepCounter, TransformedEnv
-from torchrl.envs.utils import ExplorationType, step_mdp
+from torchrl.envs.utils import step_mdp
 from torchrl.objectives import SoftUpdate
 
 from torchrl_quad import HoveringEnv, ObservationNormalizer, VisitedStateBuffer, differentiable_rollout
@@ -34,18 +34,9 @@ from torchrl_quad.objectives import BPTTLoss
 FEATURES = ["observation", ("state", "velocity")]
 
 
-def norm():
-    return of_torchrl.ObservationNorm(loc=0.1, scale=2.0, in_keys=["observation"], standard_normal=True)
-
-
-def frames(**kwargs):
-    return of_torchrl.CatFrames(N=3, dim=-1, in_keys=["observation"], **kwargs)
-
-
-def tensors():
-    return of_torchrl.CatTensors(FEATURES, "observation", del_keys=False)
-
-
+norm = partial(of_torchrl.ObservationNorm, loc=0.1, scale=2.0, in_keys=["observation"], standard_normal=True)
+frames = partial(of_torchrl.CatFrames, N=3, dim=-1, in_keys=["observation"])
+tensors = partial(of_torchrl.CatTensors, FEATURES, "observation", del_keys=False)
 BEFORE_THE_POLICY = {
     "normalised": lambda: [norm()],
     "frames": lambda: [frames()],
@@ -72,26 +63,8 @@ def make_loss(name, env, actor):
     return loss
 
 
-def lively(actor):
-    """The actor with weights large enough for its input to matter."""
-    with torch.no_grad():
-        for parameter in actor.parameters():
-            parameter += 0.05 * torch.randn_like(parameter)
-    return actor
-
-
 def total(out):
     return sum(value for key, value in out.items() if key.startswith("loss_"))
-
-
-def total_reward(env, actor):
-    flight, _ = differentiable_rollout(env, actor, None, 9, exploration_type=ExplorationType.DETERMINISTIC)
-    assert flight["next", "done"].sum() == 2
-    return flight["next", "reward"].sum()
-
-
-def gradient(env, actor):
-    return torch.cat([g.flatten() for g in torch.autograd.grad(total_reward(env, actor), list(actor.parameters()))])
 
 
 @pytest.fixture
@@ -117,41 +90,9 @@ def test_specs_hold_under_transforms(task, name):
     check_env_specs(env, break_when_any_done="both")
 
 
-@pytest.mark.parametrize("name", BEFORE_THE_POLICY)
-def test_gradients_through_transforms_that_the_policy_sees_are_finite_differences(name):
-    env = make(BEFORE_THE_POLICY[name]())
-    actor = lively(make_actor(env))
-    start = parameters_to_vector(actor.parameters()).detach()
-    direction = torch.randn_like(start)
-    along = gradient(env, actor) @ direction
-
-    def at(step):
-        vector_to_parameters(start + step * direction, actor.parameters())
-        with torch.no_grad():
-            return total_reward(env, actor)
-
-    assert along.abs() > 1e-3
-    torch.testing.assert_close((at(1e-6) - at(-1e-6)) / 2e-6, along, rtol=1e-5, atol=1e-8)
-
-
-def test_gradients_through_a_change_of_precision_are_those_of_either():
-    exact = make([], seed=1)
-    actor = lively(make_actor(exact))
-    expected = gradient(exact, actor)
-    start = exact.reset()["state"]
-    up = of_torchrl.DTypeCastTransform(torch.float32, torch.float64)
-    for env in (make([of_torchrl.DoubleToFloat()]), make([up], dtype=torch.float32)):
-        env.set_initial_state_source(lambda n: start)
-        same = make_actor(env)
-        same.load_state_dict(actor.state_dict())
-        result = gradient(env, same)
-        assert result.dtype is env.observation_spec["observation"].dtype
-        assert (result - expected).norm() < 1e-3 * expected.norm()
-
-
 def test_frames_are_remembered_in_the_next_horizon_without_their_graph_and_restarted_in_visited_states():
     env = make([frames()])
-    actor = lively(make_actor(env))
+    actor = make_actor(env)
     _, carry = differentiable_rollout(env, actor, None, 3)
     for _ in range(3):
         flight, following = differentiable_rollout(env, actor, carry, 2)
@@ -167,11 +108,6 @@ def test_frames_are_remembered_in_the_next_horizon_without_their_graph_and_resta
     assert torch.equal(one, two) and torch.equal(two, three)
     torch.testing.assert_close(three[:, :3], carry["state", "target"] - carry["state", "position"])
     assert (carry["step_count"] == 0).all() and (carry["episode_reward"] == 0).all()
-
-
-def test_a_transform_that_deletes_the_state_is_refused():
-    env = TransformedEnv(HoveringEnv(num_envs=2), of_torchrl.CatTensors(FEATURES, "features"))
-    refuses("step: the state lacks velocity. A state is restored whole", env.rollout, 2)
 
 
 @pytest.mark.parametrize("name", ["all", "double to float"])
@@ -272,13 +208,15 @@ def test_specs_are_locked_have_an_unbatched_form_and_are_what_a_step_writes(task
         assert env.is_spec_locked and env.input_spec.is_locked and env.output_spec.is_locked
         with pytest.raises(RuntimeError, match="lock"):
             env.input_spec["full_action_spec", "action"] = Unbounded(())
-        env = pickle.loads(pickle.dumps(env))
+        env, original = pickle.loads(pickle.dumps(env)), env
     assert not short(task, spec_locked=False).is_spec_locked
     # TestEnvBase::test_single_env_spec
     assert env.full_action_spec_unbatched["action"].shape == (4,) and env.full_reward_spec_unbatched.shape == ()
     for batched, single in ((env.output_spec, env.output_spec_unbatched), (env.input_spec, env.input_spec_unbatched)):
         assert not single.shape and batched.is_in(single.zeros(env.shape))
+    assert type(env) is TASKS[task]
     fake, step = env.fake_tensordict(), env.rand_step(env.reset())
+    assert (original.step(step.exclude("next"))["next"] == step["next"]).all()
     assert set(fake.keys(True, True)) == set(step.keys(True, True)) and env.output_spec["full_done_spec"].is_in(step)
     # TestEnvBase::test_batch_locked
     refuses("Expected a tensordict with shape==env.batch_size", env.step, step.expand(2, 3).clone(), error=RuntimeError)

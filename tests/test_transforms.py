@@ -5,29 +5,8 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from tensordict.nn import TensorDictModule
-from torchrl.envs import (
-    ActionScaling,
-    CatFrames,
-    CatTensors,
-    ClipTransform,
-    Compose,
-    DoubleToFloat,
-    DTypeCastTransform,
-    EnvBase,
-    ExcludeTransform,
-    FrameSkipTransform,
-    InitTracker,
-    ObservationNorm,
-    RenameTransform,
-    RewardClipping,
-    RewardScaling,
-    RewardSum,
-    SelectTransform,
-    StepCounter,
-    TargetReturn,
-    TrajCounter,
-    TransformedEnv,
-)
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import transforms as T
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_visual_actor
@@ -41,44 +20,44 @@ COUNTED = ["observation", "step_count", "is_init"]
 
 def normalizer(key="observation", size=13, **keys):
     loc, scale = torch.linspace(-1, 1, size).double(), torch.linspace(0.5, 2, size).double()
-    return ObservationNorm(loc, scale, in_keys=[key], standard_normal=True, **keys)
+    return T.ObservationNorm(loc, scale, in_keys=[key], standard_normal=True, **keys)
 
 
 def frames(count, key="observation", out_keys=None, **padding):
-    return CatFrames(count, -1, [key], out_keys, **padding)
+    return T.CatFrames(count, -1, [key], out_keys, **padding)
 
 
 TRANSFORMS = {
-    "scaled reward": lambda: RewardScaling(0.3, 2.0),
-    "clipped reward": lambda: RewardClipping(-0.2, 0.1),
-    "sum": RewardSum,
-    "sum of clipped": lambda: Compose(RewardScaling(0.1, 3.0), RewardSum(), RewardClipping(-0.2, 0.1)),
-    "target": lambda: TargetReturn(7.0),
-    "constant target": lambda: TargetReturn(7.0, mode="constant"),
-    "steps": StepCounter,
-    "starts": InitTracker,
-    "trajectories": TrajCounter,
+    "scaled reward": lambda: T.RewardScaling(0.3, 2.0),
+    "clipped reward": lambda: T.RewardClipping(-0.2, 0.1),
+    "sum": T.RewardSum,
+    "sum of clipped": lambda: T.Compose(T.RewardScaling(0.1, 3.0), T.RewardSum(), T.RewardClipping(-0.2, 0.1)),
+    "target": lambda: T.TargetReturn(7.0),
+    "constant target": lambda: T.TargetReturn(7.0, mode="constant"),
+    "steps": T.StepCounter,
+    "starts": T.InitTracker,
+    "trajectories": T.TrajCounter,
     "normalised": normalizer,
     "copied": lambda: normalizer(out_keys=["seen"]),
-    "concatenated": lambda: CatTensors(["observation", ("state", "velocity")], "features", del_keys=False),
-    "concatenated alone": lambda: CatTensors(["observation"], "features"),
-    "clipped": lambda: ClipTransform(in_keys=OBSERVATION, low=-0.5, high=1.0),
-    "cast": lambda: DTypeCastTransform(torch.float64, torch.float32, in_keys=OBSERVATION, in_keys_inv=["action"]),
-    "all of float": DoubleToFloat,
-    "scaled action": lambda: ActionScaling(loc=torch.tensor(0.1).double(), scale=torch.tensor(0.7).double()),
-    "clipped action": lambda: ClipTransform(in_keys_inv=["action"], in_keys=[], low=-0.1, high=0.3),
-    "renamed": lambda: RenameTransform(["observation"], ["seen"]),
+    "concatenated": lambda: T.CatTensors(["observation", ("state", "velocity")], "features", del_keys=False),
+    "concatenated alone": lambda: T.CatTensors(["observation"], "features"),
+    "clipped": lambda: T.ClipTransform(in_keys=OBSERVATION, low=-0.5, high=1.0),
+    "cast": lambda: T.DTypeCastTransform(torch.float64, torch.float32, in_keys=OBSERVATION, in_keys_inv=["action"]),
+    "all of float": T.DoubleToFloat,
+    "scaled action": lambda: T.ActionScaling(loc=torch.tensor(0.1).double(), scale=torch.tensor(0.7).double()),
+    "clipped action": lambda: T.ClipTransform(in_keys_inv=["action"], in_keys=[], low=-0.1, high=0.3),
+    "renamed": lambda: T.RenameTransform(["observation"], ["seen"]),
     "frames": lambda: frames(3),
     "frames after a number": lambda: frames(2, padding="constant", padding_value=0.5),
-    "frames of frames": lambda: Compose(frames(2), normalizer(size=26), frames(3)),
-    "clipped frames": lambda: Compose(frames(3), ClipTransform(in_keys=OBSERVATION, low=-0.5, high=1.0)),
+    "frames of frames": lambda: T.Compose(frames(2), normalizer(size=26), frames(3)),
+    "clipped frames": lambda: T.Compose(frames(3), T.ClipTransform(in_keys=OBSERVATION, low=-0.5, high=1.0)),
     "frames of an entry": lambda: frames(3, ("state", "velocity"), ["seen"]),
-    "limited": lambda: StepCounter(max_steps=3),
-    "limited twice": lambda: Compose(StepCounter(max_steps=4), StepCounter(3, step_count_key="more")),
-    "read": lambda: Compose(RewardScaling(0.3, 2.0), TargetReturn(7.0), RewardSum()),
-    "counted": lambda: Compose(StepCounter(7), InitTracker(), CatTensors(COUNTED, "seen", del_keys=False)),
-    "left out": lambda: ExcludeTransform(("metrics", "position_error"), "success"),
-    "selected": lambda: SelectTransform("observation", *HoveringEnv().state_keys, ("reward_terms", "velocity")),
+    "limited": lambda: T.StepCounter(max_steps=3),
+    "limited twice": lambda: T.Compose(T.StepCounter(max_steps=4), T.StepCounter(3, step_count_key="more")),
+    "read": lambda: T.Compose(T.RewardScaling(0.3, 2.0), T.TargetReturn(7.0), T.RewardSum()),
+    "counted": lambda: T.Compose(T.StepCounter(7), T.InitTracker(), T.CatTensors(COUNTED, "seen", del_keys=False)),
+    "left out": lambda: T.ExcludeTransform(("metrics", "position_error"), "success"),
+    "selected": lambda: T.SelectTransform("observation", *HoveringEnv().state_keys, ("reward_terms", "velocity")),
 }
 
 
@@ -97,7 +76,7 @@ def fly(env, actor, *, inside):
             patch.setattr(HoveringEnv, "rollout", EnvBase.rollout)
         env.set_seed(1)
         for transform in transforms_of(env):
-            if isinstance(transform, TrajCounter):
+            if isinstance(transform, T.TrajCounter):
                 transform._traj_count.value = 0
         torch.manual_seed(1)
         first, carry = differentiable_rollout(env, actor, env.reset(), 4)
@@ -119,7 +98,7 @@ def check(transform, in_keys=("observation",), *, coarse=False, recurrent=False,
     options = {"recurrent": True, "hidden_size": 5, "noise_correlation": 0.4} if recurrent else {}
     actor = make_actor(env, (8, 7), in_keys=list(in_keys), return_log_prob=True, **options)
     if recurrent:
-        env = TransformedEnv(base, Compose(transform.clone(), InitTracker(), actor.make_tensordict_primer()))
+        env = TransformedEnv(base, T.Compose(transform.clone(), T.InitTracker(), actor.make_tensordict_primer()))
     expected = fly(env, actor, inside=False)
     if backend:
         base.compile(backend=backend)
@@ -134,31 +113,18 @@ def test_each_transform_flies_inside_with_torchrl_s_numbers_and_gradients(name):
 
 
 def test_a_memory_flies_under_transforms():
-    check(Compose(normalizer(), RewardSum()), recurrent=True)
+    check(T.Compose(normalizer(), T.RewardSum()), recurrent=True)
 
 
 @pytest.mark.parametrize("backend", ["eager", pytest.param("inductor", marks=pytest.mark.slow)])
 def test_transforms_and_memory_fly_inside_the_compiled_step(backend):
-    check(
-        Compose(
-            CatTensors(["observation", ("state", "rotor_speed")], "both", del_keys=False),
-            normalizer("both", 17),
-            ClipTransform(in_keys=["both"], low=-3.0, high=3.0),
-            frames(3, "both"),
-            RewardScaling(0.1, 3.0),
-            RewardSum(),
-            TargetReturn(7.0),
-            StepCounter(max_steps=3),
-            ActionScaling(loc=torch.tensor(0.1).double(), scale=torch.tensor(0.7).double()),
-        ),
-        ["both", ("state", "velocity"), "target_return", "step_count"],
-        recurrent=True,
-        backend=backend,
-        wind={"gust": 0.5},
-        control_dt=0.005,  # a physics step
-        integrator="euler",
-        action_delay=0,
-    )
+    both = T.CatTensors(["observation", ("state", "rotor_speed")], "both", del_keys=False)
+    read = [both, normalizer("both", 17), T.ClipTransform(in_keys=["both"], low=-3.0, high=3.0), frames(3, "both")]
+    paid = [T.RewardScaling(0.1, 3.0), T.RewardSum(), T.TargetReturn(7.0), T.StepCounter(max_steps=3)]
+    transforms = T.Compose(*read, *paid, TRANSFORMS["scaled action"]())
+    keys = ["both", ("state", "velocity"), "target_return", "step_count"]
+    one = {"control_dt": 0.005, "integrator": "euler", "action_delay": 0}  # a physics step
+    check(transforms, keys, recurrent=True, backend=backend, wind={"gust": 0.5}, **one)
 
 
 @settings(max_examples=6, deadline=None)
@@ -168,7 +134,7 @@ def test_transforms_and_memory_fly_inside_the_compiled_step(backend):
 )
 def test_any_order_of_transforms_flies_inside_with_torchrl_s_numbers(names, counters):
     env = HoveringEnv(num_envs=2, dtype=torch.float64)
-    env = TransformedEnv(env, Compose(*(TRANSFORMS[name]() for name in names)))
+    env = TransformedEnv(env, T.Compose(*(TRANSFORMS[name]() for name in names)))
     try:
         env.rollout(2)
     except (IndexError, KeyError, NotImplementedError, RuntimeError):
@@ -176,56 +142,56 @@ def test_any_order_of_transforms_flies_inside_with_torchrl_s_numbers(names, coun
     reason = flight_mode(env, make_actor(env)).reason
     assume(not any(x in reason for x in ("drops it before the next", "is written before, by another", "clips frames")))
     counters &= set(env.observation_spec.keys())
-    check(Compose(*(TRANSFORMS[name]() for name in names)), ["observation", *sorted(counters)])
+    check(T.Compose(*(TRANSFORMS[name]() for name in names)), ["observation", *sorted(counters)])
 
 
 def test_what_flies_in_torchrl_s_loop_says_why():
     def reason(*transforms, policy=None, compile=True):
-        env = TransformedEnv(HoveringEnv(num_envs=2, compile=compile), Compose(*transforms))
+        env = TransformedEnv(HoveringEnv(num_envs=2, compile=compile), T.Compose(*transforms))
         return flight_mode(env, policy or make_actor(env, (8,)))
 
-    assert reason(RewardSum()) == ("inside", "")
+    assert reason(T.RewardSum()) == ("inside", "")
     assert reason(compile=False).reason.startswith("the environment is not compiled")
-    assert reason(StepCounter(max_steps=5)) == ("inside", "")
-    assert reason(RewardSum(), FrameSkipTransform(2)).reason.startswith("FrameSkipTransform is none of")
-    assert "'step_count' is written before" in reason(StepCounter(max_steps=3), StepCounter(max_steps=4)).reason
-    clip = ClipTransform(in_keys=OBSERVATION, low=-0.5, high=1.0)
+    assert reason(T.StepCounter(max_steps=5)) == ("inside", "")
+    assert reason(T.RewardSum(), T.FrameSkipTransform(2)).reason.startswith("FrameSkipTransform is none of")
+    assert "'step_count' is written before" in reason(T.StepCounter(max_steps=3), T.StepCounter(max_steps=4)).reason
+    clip = T.ClipTransform(in_keys=OBSERVATION, low=-0.5, high=1.0)
     for of_frames in ((TRANSFORMS["frames of frames"](), clip), (frames(2), normalizer(size=26), clip.clone())):
-        assert "it clips frames of frames, or frames that" in reason(RewardSum(), *of_frames).reason
-    for drops in (ExcludeTransform("step_count"), RenameTransform(["step_count"], ["n"])):
-        assert reason(StepCounter(), drops).reason.startswith("'step_count' is counted in a step, and a later")
+        assert "it clips frames of frames, or frames that" in reason(T.RewardSum(), *of_frames).reason
+    for drops in (T.ExcludeTransform("step_count"), T.RenameTransform(["step_count"], ["n"])):
+        assert reason(T.StepCounter(), drops).reason.startswith("'step_count' is counted in a step, and a later")
     env, flights = HoveringEnv(num_envs=2), []
-    for flown in (env, TransformedEnv(env, FrameSkipTransform(3))):  # it flies no further, as docs/engine.md says
+    for flown in (env, TransformedEnv(env, T.FrameSkipTransform(3))):  # it flies no further, as docs/engine.md says
         env.set_seed(0)
         flights.append(flown.rollout(2, actions=env.hover_action.expand(2, 2, 4))["next"])
     torch.testing.assert_close(flights[1]["state"].to_dict(), flights[0]["state"].to_dict(), rtol=0, atol=0)
     torch.testing.assert_close(flights[1]["reward"], 3 * flights[0]["reward"])
     reads = TensorDictModule(lambda x, y: x[:, :4].tanh(), ["observation", "step_count"], ["action"])
-    assert reason(StepCounter(), policy=reads).mode == "called"
+    assert reason(T.StepCounter(), policy=reads).mode == "called"
     reads.in_keys[1] = "traj_count"
-    assert reason(TrajCounter(), policy=reads) == ("loop", "the policy reads 'traj_count', which is counted outside")
+    assert reason(T.TrajCounter(), policy=reads) == ("loop", "the policy reads 'traj_count', which is counted outside")
     called = TensorDictModule(lambda x: x[:, :4].tanh(), ["observation"], ["action"])
-    assert reason(RewardSum(), policy=called).reason.startswith("TensorDictModule has no form on plain tensors")
+    assert reason(T.RewardSum(), policy=called).reason.startswith("TensorDictModule has no form on plain tensors")
 
 
 def test_of_what_a_policy_reads_the_image_alone_has_no_gradient_whatever_it_is_called():
     base = HoveringEnv(num_envs=2, camera={"width": 6, "height": 4})
 
     def without_gradient(*transforms, make=make_actor, **options):
-        env = TransformedEnv(base, Compose(*transforms))
+        env = TransformedEnv(base, T.Compose(*transforms))
         plain = under_transforms(env, make(env, (5,), **options)).policy.plain()
         plain.without_gradient = base.control_step.constants
         return plain.without_gradient
 
-    stacked = CatFrames(3, -3, ["depth"], ["images"])
+    stacked = T.CatFrames(3, -3, ["depth"], ["images"])
     assert without_gradient(stacked, make=make_visual_actor, image_key="images") == {"images"}
-    renamed = ExcludeTransform("depth"), RenameTransform(["observation"], ["depth"])
+    renamed = T.ExcludeTransform("depth"), T.RenameTransform(["observation"], ["depth"])
     assert without_gradient(*renamed, in_keys=["depth"]) == set()
 
 
 def test_the_first_step_reads_what_the_start_says():
     base = HoveringEnv(num_envs=2, dtype=torch.float64)
-    env = TransformedEnv(base, Compose(normalizer(), ExcludeTransform("success")))
+    env = TransformedEnv(base, T.Compose(normalizer(), T.ExcludeTransform("success")))
     start, actor = env.reset(), make_actor(env, (8,))
     start["observation"] = start["observation"] + 1.0
     rollout, _ = differentiable_rollout(env, actor, start, 2, exploration_type=ExplorationType.DETERMINISTIC)

@@ -213,11 +213,9 @@ def test_what_is_no_environment_of_its_kind_is_refused(adapter):
     for wrong in (None, "hovering", HoveringEnv, 3, gymnasium.make_vec("CartPole-v1", num_envs=2), PendulumEnv()):
         refused(adapter, wrong)
     if adapter is not DronesVecEnv:
-        with pytest.raises(
-            ValueError, match="shows depth images, which plain observations leave out. Build it with cam"
-        ):
-            adapter(HoveringEnv(2, camera={"width": 6, "height": 4}))
-    if adapter is DronesVecEnv:
+        seeing = HoveringEnv(2, camera={"width": 6, "height": 4})
+        refuses("shows depth images, which plain observations leave out. Build it with cam", adapter, seeing)
+    else:
         with pytest.raises(ValueError, match=r"'NextStep', and stable-baselines3 .* autoreset_mode=\"SameStep\""):
             adapter(gymnasium.make_vec("torchrl_quad/Hovering-v0", num_envs=2))
     with pytest.raises(AttributeError, match="no 'Rllib'. Choose from: .*DronesVecEnv, "):

@@ -44,9 +44,8 @@ def test_gains_by_hand_in_the_units_of_each_autopilot():
     loop = {"rate_gain": [20.0] * 3, "rate_damping": [1e-3] * 3, "max_body_rate": [6.0] * 3}
     body = {"mass": 0.1, "gravity": 10.0, "inertia": [1e-3] * 3, "yaw_torque_coefficient": 0.01}
     found = autopilots.files(contract(**rotors, **loop, **body))
-    ours, px4, crazyflie = (
-        numbers(found[x], y) for x, y in zip(autopilots.AUTOPILOTS, (" = ", "\t", "="), strict=True)
-    )
+    signs = zip(autopilots.AUTOPILOTS, (" = ", "\t", "="), strict=True)
+    ours, px4, crazyflie = (numbers(found[name], sign) for name, sign in signs)
     # Hover at half the speed, where a unit of the signal has a slope of 1 N: 0.4 N m about roll.
     assert int(ours["p_roll"]) == round(1e-3 * 20.0 / 0.4 * 1000.0 * math.radians(1.0) / 0.032029)
     assert int(ours["d_roll"]) == round(1e-3 / 0.4 * 1000.0 * math.radians(1.0) / 0.000529)
@@ -198,11 +197,14 @@ def flown(simulator, loop="contract", dynamics="betaflight"):
     return np.array(found)
 
 
+def apart(dynamics, theirs):
+    return np.sqrt(np.square(flown("torchrl_quad", dynamics=dynamics) - theirs).mean())
+
+
 def test_our_model_of_a_pid_loop_answers_as_the_one_in_mujoco():
     pytest.importorskip("mujoco")
     theirs = flown("mujoco", "pid")
-    model, usual = (np.sqrt(np.square(flown("torchrl_quad", dynamics=x) - theirs).mean()) for x in ("pid", "quadrotor"))
-    assert model < 0.01 < 0.03 < usual
+    assert apart("pid", theirs) < 0.01 < 0.03 < apart("quadrotor", theirs)
 
 
 def is_running(pid):
@@ -229,10 +231,7 @@ def test_the_firmware_answers_twice_the_same_as_our_model_of_it_and_leaves_nothi
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     theirs = flown("betaflight", "own")
     np.testing.assert_array_equal(flown("betaflight", "own"), theirs)
-    model, usual = (
-        np.sqrt(np.square(flown("torchrl_quad", dynamics=x) - theirs).mean()) for x in ("betaflight", "quadrotor")
-    )
-    assert model < 0.01 < 0.03 < usual
+    assert apart("betaflight", theirs) < 0.01 < 0.03 < apart("quadrotor", theirs)
     kept = sorted(tmp_path.rglob("*"))
     command = [sys.executable, "-c", INTERRUPTED]
     with subprocess.Popen(command, cwd=ROOT / "tests", stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:

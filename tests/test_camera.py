@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from flying import start
 from gymnasium.utils.env_checker import check_env
 from PIL import Image
 from refusals import cases, refuses
@@ -136,11 +137,9 @@ def test_each_episode_has_another_forest_that_keeps_its_gaps_and_is_restored_wit
 def test_a_drone_crashes_into_what_stands_in_its_way_and_through_the_finish_it_succeeds():
     pole = {"cylinders": [{"base": [5.0, 0.0, 0.0], "radius": 0.02, "height": 3.0}]}
     env = ForestEnv(num_envs=2, scene=pole, camera=None, action_delay=0)
-    td = env.reset()
-    state = td["state"]
-    state["position"] = torch.tensor([[4.6, 0.0, 1.5], [29.9, 0.0, 1.5]])
-    state["velocity"] = torch.tensor([[60.0, 0.0, 0.0], [10.0, 0.0, 0.0]])  # 1.2 m in one step: right through it
-    step = env.step(env.reset(td, set_state=True).set("action", env.hover_action.expand(2, 4)))["next"]
+    velocity = [[60.0, 0.0, 0.0], [10.0, 0.0, 0.0]]  # 1.2 m in one step: right through it
+    td = start(env, position=[[4.6, 0.0, 1.5], [29.9, 0.0, 1.5]], velocity=velocity)
+    step = env.step(td.set("action", env.hover_action.expand(2, 4)))["next"]
     assert (step["state", "position"][0, 0] > 5.5).item(), "it is far behind the pole at the end of the step"
     assert step["crash"].flatten().tolist() == [True, False]
     assert step["state", "collided"].flatten().tolist() == [True, False]
@@ -163,10 +162,8 @@ def test_a_camera_is_an_option_of_every_task_and_works_under_transforms():
 
 
 def test_a_fixed_scene_comes_from_a_file_and_stands_in_no_state(tmp_path):
-    (tmp_path / "room.yaml").write_text(
-        "walls: [{point: [8, 0, 0], normal: [-2, 0, 0]}]\nspheres: [{centre: [3, 1, 2], radius: 0.3}]\n"
-        "boxes: [{centre: [3, -2, 0.5], size: [1, 1, 1], yaw: 0.7}]\n"
-    )
+    room = "walls: [{point: [8, 0, 0], normal: [-2, 0, 0]}]\nspheres: [{centre: [3, 1, 2], radius: 0.3}]\n"
+    (tmp_path / "room.yaml").write_text(room + "boxes: [{centre: [3, -2, 0.5], size: [1, 1, 1], yaw: 0.7}]\n")
     env = HoveringEnv(num_envs=2, scene=str(tmp_path / "room.yaml"), camera={})
     assert "scene" not in env.reset()["state"].keys()  # noqa: SIM118, a tensordict
     solids = env.scene.solids({})
@@ -328,8 +325,6 @@ def test_random_obstacles_keep_clear_of_the_start_and_of_the_target(kind, size):
 def test_critics_read_how_far_the_nearest_obstacle_is_and_where_it_is_not():
     half = math.sqrt(0.5)
     env = HoveringEnv(num_envs=1, scene=POLE, dtype=torch.float64)
-    td = env.reset()
-    td["state", "position"] = torch.tensor([[4.0, 0.0, 2.0]], dtype=torch.float64)
-    td["state", "quaternion"] = torch.tensor([[half, 0.0, 0.0, half]], dtype=torch.float64)  # to the left, along y
-    seen = env.reset(td, set_state=True)["obstacle"]
+    to_the_left = [half, 0.0, 0.0, half]  # along y
+    seen = start(env, position=[4.0, 0.0, 2.0], quaternion=to_the_left)["obstacle"]
     assert seen.flatten().tolist() == pytest.approx([0.8 - env.scene.radius, 0.0, 1.0, 0.0], abs=1e-9)

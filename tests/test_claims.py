@@ -272,10 +272,8 @@ def test_the_readme_says_how_many_episodes_are_solved_in_a_third_party_simulator
     }
     columns = [("shipped", "torchrl_quad", "contract"), ("shipped", "MuJoCo", "contract"), ("shipped", "MuJoCo", "pid")]
     columns.append(("visfly", "Betaflight", "own"))
-    shares = {
-        task: [f"{100 * solved[(task, *column)]:.3g} %" for column in columns]
-        for task in ("hovering", "tracking", "landing", "racing")
-    }
+    tasks = ("hovering", "tracking", "landing", "racing")
+    shares = {task: [f"{100 * solved[(task, *column)]:.3g} %" for column in columns] for task in tasks}
     trained = f"; trained with `env.firmware=pid` {100 * solved['racing', 'visfly_pid', 'MuJoCo', 'pid']:.3g} %"
     shares["racing"][2] += trained
     assert shares["hovering"] == shares["tracking"] == shares["landing"]

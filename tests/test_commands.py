@@ -112,9 +112,8 @@ def is_run(program):
     assert stem in (*RECIPES, *re.findall(r"\w+", text)), f"{SMOKE[program]} knows nothing of {program}"
 
 
-PROGRAM = re.compile(
-    r"(?:[A-Z_]+=\S+ )*(?:\.venv/bin/)?(python|torchrun|make|pip|pytest|pre-commit|wandb|tensorboard) \S"
-)
+NAMES = "python|torchrun|make|pip|pytest|pre-commit|wandb|tensorboard"
+PROGRAM = re.compile(rf"(?:[A-Z_]+=\S+ )*(?:\.venv/bin/)?({NAMES}) \S")
 IN_CODE = re.compile(r"(?<![\w/])(?:python|torchrun)(?: -\S+)* [\w./]*\.py[^\n`]*")
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from deploying import FLOWN, build, measured, resting
-from refusals import cases
+from refusals import cases, refuses
 from small_runs import run
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -70,8 +70,7 @@ def test_each_fault_has_a_name_and_changes_nothing_or_hovers_and_is_counted(task
         state = {key: x for key, x in (good | changes).items() if x is not None}
     for bundle in (raising, hovering, untouched):
         bundle(good)
-    with pytest.raises(kind, match=message):
-        raising(state)
+    refuses(message, raising, state, error=kind)
     assert raising.faults == {kind.__name__: 1}
     thrust, rates = hovering(state)
     weight = hovering.contract["output"]["thrust"]["weight"]
@@ -112,12 +111,10 @@ def test_a_bundle_keeps_the_queue_and_starts_again(export_once):
     assert bundle.progress["phase"] == 1.0
     bundle(resting())
     assert not np.array_equal(bundle.action, actions[0])
-    with pytest.raises(TypeError, match="reset: tracking has no 'gate'. Choose from: phase"):
-        bundle.reset(gate=1)
+    refuses("reset: tracking has no 'gate'. Choose from: phase", bundle.reset, error=TypeError, gate=1)
     bundle.reset()
     np.testing.assert_array_equal(bundle.progress["phase"], bundle.starts()["phase"][0])
-    with pytest.raises(ValueError, match='on_fault must be "raise" or "hover", got \'land\''):
-        load_bundle(bundle.folder, on_fault="land")
+    refuses('on_fault must be "raise" or "hover", got \'land\'', load_bundle, bundle.folder, on_fault="land")
 
 
 def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch, trace_once):
@@ -130,46 +127,45 @@ def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch, trace_once):
             self.calls += 1
             return super().observe(state) + 1e-3 * self.calls
 
-    def refuses(match, policy=actor, env=env, error=ValueError, **options):
-        with pytest.raises(error, match=match):
-            export_policy(policy, env, tmp_path / "policy", **options)
+    def fails(match, policy=actor, env=env, error=ValueError, **options):
+        refuses(match, export_policy, policy, env, tmp_path / "policy", error=error, **options)
 
     module = TensorDictModule(nn.Linear(13, 4), in_keys=["observation"], out_keys=["action"])
-    refuses("exports what make_actor and make_visual_actor build, .* This TensorDictModule is something else", module)
+    fails("exports what make_actor and make_visual_actor build, .* This TensorDictModule is something else", module)
     knows = make_actor(env, in_keys=["observation", ("state", "rotor_speed")])
-    refuses(r"reads \['observation', \('state', 'rotor_speed'\)\]. A drone only has", knows)
+    fails(r"reads \['observation', \('state', 'rotor_speed'\)\]. A drone only has", knows)
     leaky = make_actor(env)
     leaky[0].module.mlp[1] = nn.LeakyReLU(0.2)
-    refuses(r"cannot write LeakyReLU\(negative_slope=0.2\)", leaky)
+    fails(r"cannot write LeakyReLU\(negative_slope=0.2\)", leaky)
     hooked = make_actor(env)
     hooked[0].module.mlp.register_forward_hook(lambda *_: None)
-    refuses("exports what make_actor and make_visual_actor build", hooked)
-    refuses("the bundle observes something else than Counting does, by", env=Counting(num_envs=64, max_episode_steps=8))
-    refuses("the policy reads 13 numbers, the environment observes 40", env=make_env("tracking", num_envs=2))
-    refuses("supports only one transform, an ObservationNormalizer", env=TransformedEnv(env, RewardSum()))
+    fails("exports what make_actor and make_visual_actor build", hooked)
+    fails("the bundle observes something else than Counting does, by", env=Counting(num_envs=64, max_episode_steps=8))
+    fails("the policy reads 13 numbers, the environment observes 40", env=make_env("tracking", num_envs=2))
+    fails("supports only one transform, an ObservationNormalizer", env=TransformedEnv(env, RewardSum()))
     broken = make_actor(env)
     with torch.no_grad():
         broken[0].module.mlp[0].bias[0] = math.nan
-    refuses("the weights of the policy, or its normaliser, are not finite", broken)
+    fails("the weights of the policy, or its normaliser, are not finite", broken)
     trace_once("hovering")
     strong = load_drone("visfly").replace(max_thrust_to_weight=30.0)
     with pytest.warns(DroneWarning, match="the rotors reach 4.446 times the weight"):
         strongest = HoveringEnv(num_envs=64, max_episode_steps=4, drone=strong)
     said = r"export_policy: output.thrust.range_in_weights.1.: 30.0 is greater than the maximum of 20. A bundle flies"
-    refuses(said, env=strongest)
+    fails(said, env=strongest)
     other = HoveringEnv(num_envs=64, max_episode_steps=8)
     other.dynamics.controller.action_units = {"thrust": "N", "throttle": "1"}
-    refuses("exports the controls rates, attitude, velocity, rotor_thrusts; got 'rates'", env=other)
+    fails("exports the controls rates, attitude, velocity, rotor_thrusts; got 'rates'", env=other)
     of_an_error = ObservationNormalizer(env, ("metrics", "position_error"))
-    refuses('the normalizer must be that of "observation", got ', normalizer=of_an_error)
-    refuses("needs an environment of this package, got PendulumEnv", env=PendulumEnv())
+    fails('the normalizer must be that of "observation", got ', normalizer=of_an_error)
+    fails("needs an environment of this package, got PendulumEnv", env=PendulumEnv())
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "onnx", None)
-        refuses("needs onnx onnxruntime onnxscript: pip install onnx onnxruntime onnxscript", error=ImportError)
+        fails("needs onnx onnxruntime onnxscript: pip install onnx onnxruntime onnxscript", error=ImportError)
     assert not (tmp_path / "policy").exists()
     (tmp_path / "policy").mkdir()
     (tmp_path / "policy" / "thesis.txt").write_text("")
-    refuses("exists and is no bundle", error=FileExistsError)
+    fails("exists and is no bundle", error=FileExistsError)
 
 
 def test_a_normalizer_is_that_of_the_transforms_or_is_given_beside_a_bare_environment(tmp_path, trace_once):
@@ -264,8 +260,7 @@ def test_a_step_that_failed_and_is_repeated_equals_one_that_never_failed(export_
 def test_a_start_that_makes_no_sense_is_refused_and_changes_nothing(task, progress, wanted, export_once):
     bundle = load_bundle(export_once(task)[2])
     before = bundle.progress
-    with pytest.raises(UserValueError, match=f"^{bundle.folder}: {list(progress)[-1]} must be {wanted}"):
-        bundle.reset(**progress)
+    refuses(f"^{bundle.folder}: {list(progress)[-1]} must be {wanted}", bundle.reset, error=UserValueError, **progress)
     np.testing.assert_equal(bundle.progress, before)
 
 

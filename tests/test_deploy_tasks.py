@@ -269,10 +269,8 @@ def test_another_runtime_is_found_and_a_graph_that_it_cannot_read_or_that_leaves
     folder, about = copied
 
     def load(*nodes, scale=1.0):
-        reads, writes = (
-            [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", n])]
-            for name, n in (("observation", 13), ("action", 4))
-        )
+        shapes = (("observation", ["batch", 13]), ("action", ["batch", 4]))
+        reads, writes = ([helper.make_tensor_value_info(name, TensorProto.FLOAT, x)] for name, x in shapes)
         weight = onnx.numpy_helper.from_array(np.full((4, 13), scale, np.float32), "w")
         graph = helper.make_graph(nodes, "policy", reads, writes, [weight])
         model = helper.make_model(graph, ir_version=10, opset_imports=[helper.make_opsetid("", 20)])

@@ -114,10 +114,8 @@ def test_leftovers_of_dead_processes_go_and_those_of_other_machines_and_the_livi
 
 def test_processes_that_add_to_one_table_lose_no_row(tmp_path):
     path = tmp_path / "results.csv"
-    program = (
-        "import sys; from torchrl_quad.files import add_rows\n"
-        "for i in range(20): add_rows(sys.argv[1], [{'who': sys.argv[2], 'i': i, f'own{sys.argv[2]}': 1}])"
-    )
+    program = "import sys; from torchrl_quad.files import add_rows\n"
+    program += "for i in range(20): add_rows(sys.argv[1], [{'who': sys.argv[2], 'i': i, f'own{sys.argv[2]}': 1}])"
     running = [subprocess.Popen([sys.executable, "-c", program, path, str(who)]) for who in range(4)]
     assert [process.wait() for process in running] == [0] * 4
     wanted = [(str(w), i) for w in range(4) for i in range(20)]

@@ -15,11 +15,8 @@ from torchrl_quad.identification.errors import UnreadableLog, WrongQuaternion
 from torchrl_quad.rotations import rotate_inverse
 
 FLIGHT = Path(__file__).parent.parent / "examples" / "data" / "figure8.csv.gz"
-GYRO = ("imu_gyro_x", "imu_gyro_y", "imu_gyro_z")
-FORCE = ("imu_acc_x", "imu_acc_y", "imu_acc_z")
-PLACE = ("px", "py", "pz")
-SPEED = ("vx", "vy", "vz")
-TURN = ("qx", "qy", "qz", "qw")
+GYRO, FORCE = (tuple(f"imu_{name}_{axis}" for axis in "xyz") for name in ("gyro", "acc"))
+PLACE, SPEED, TURN = ("px", "py", "pz"), ("vx", "vy", "vz"), ("qx", "qy", "qz", "qw")
 H = 0.5**0.5
 MOTORS = tuple(f"motor_motor_m{k}" for k in (1, 2, 3, 4))
 

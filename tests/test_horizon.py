@@ -18,16 +18,10 @@ from torchrl_quad.envs import TASKS, make_env
 from torchrl_quad.errors import Unsupported
 from torchrl_quad.modules import make_actor
 
-EVERYTHING = {
-    "action_delay": 2,
-    "observe_last_action": True,
-    "observation_noise": {"position": 0.01, "attitude": 0.01},
-    "observation_delay": 1,
-    "wind": {"mean": [1.0, 0.0, 0.0], "gust": 0.5},
-    "randomize": {"mass": {"scale": [0.8, 1.2]}, "rotor_positions": {"scale": [0.9, 1.1]}},
-    "random_start": {"tilt": 0.3, "velocity": 0.5},
-    "event_discount": 0.99,
-}
+NOISE, START = {"position": 0.01, "attitude": 0.01}, {"tilt": 0.3, "velocity": 0.5}
+EVERYTHING = {"action_delay": 2, "observe_last_action": True, "observation_delay": 1, "event_discount": 0.99}
+EVERYTHING |= {"observation_noise": NOISE, "random_start": START, "wind": {"mean": [1.0, 0.0, 0.0], "gust": 0.5}}
+EVERYTHING["randomize"] = {"mass": {"scale": [0.8, 1.2]}, "rotor_positions": {"scale": [0.9, 1.1]}}
 
 
 def fly(rollout, env, actor, start, steps):

@@ -39,15 +39,12 @@ FRAME = f"<link name='base_link'><inertial><mass>1</mass>{J}</inertial></link>" 
     f"<pose relative_to='j{i}'/><inertial><mass>0.25</mass></inertial></link>"
     for i, (x, y) in enumerate(CORNERS)
 )
-URDF = (
-    "<robot name='{}'><properties kf='1e-9' km='2e-11' thrust2weight='2' drag_coeff_xy='1e-6'/><link name='base_link'>"
-    "<inertial><mass value='0.4'/><inertia ixx='1e-3' ixy='{}' iyy='1e-3' izz='1.5e-3'/></inertial></link>"
-    + "".join(
-        f"<link name='prop{i}_link'><inertial><origin xyz='{CORNERS[k][0]} {CORNERS[k][1]} 0'/></inertial></link>"
-        for i, k in enumerate((0, 3, 1, 2))
-    )
-    + "</robot>"
-)
+URDF = "<robot name='{}'><properties kf='1e-9' km='2e-11' thrust2weight='2' drag_coeff_xy='1e-6'/>"
+URDF += "<link name='base_link'><inertial><mass value='0.4'/>"
+URDF += "<inertia ixx='1e-3' ixy='{}' iyy='1e-3' izz='1.5e-3'/></inertial></link>"
+for i, (x, y) in enumerate(CORNERS[k] for k in (0, 3, 1, 2)):
+    URDF += f"<link name='prop{i}_link'><inertial><origin xyz='{x} {y} 0'/></inertial></link>"
+URDF += "</robot>"
 L2F = {"mass": 1.0, "gravity": [0, 0, 9.8], "J": np.diag([0.01, 0.01, 0.015]).tolist(), "action_limit": [0, 1]}
 L2F |= {"rotor_positions": [[x, -y, 0] for x, y in CORNERS], "rotor_thrust_directions": [[0, 0, -1]] * 4}  # z is down
 L2F |= {"rotor_torque_directions": [[0, 0, x] for x in (1, 1, -1, -1)], "rotor_torque_constants": [0.02] * 4}
@@ -63,11 +60,8 @@ MODELS |= {"rpm2thrust": [0, 0, 4e-10], "rpm2torque": [0, 0, 8e-12]}
 MODELS |= {"mixing_matrix": [[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]]}
 TOML = "\n".join(f"[{x}]\n" + "\n".join(f"{k} = {v}" for k, v in MODELS.items()) for x in "ab")
 HOVER_RPM = np.sqrt(0.03 * 9.81 / 4 / 4e-10)
-CRAZYFLOW = (
-    "[cf]\n"
-    + "\n".join(f"{k} = {v}" for k, v in MODELS.items() if k != "thrust_tau")
-    + "\nrotor_dyn_coef = [10.0, 1e-4, 0.0, 2e-4]\ndrag_matrix = [[-0.02, 0, 0], [0, -0.02, 0], [0, 0, -0.03]]"
-)
+CRAZYFLOW = "[cf]\n" + "\n".join(f"{k} = {v}" for k, v in MODELS.items() if k != "thrust_tau")
+CRAZYFLOW += "\nrotor_dyn_coef = [10.0, 1e-4, 0.0, 2e-4]\ndrag_matrix = [[-0.02, 0, 0], [0, -0.02, 0], [0, 0, -0.03]]"
 VISFLY = {"mass": 0.46, "inertia": [0.00101, 0.00153, 0.00203], "arm_length": 0.075, "kappa": 0.016, "motor_tau": 0.033}
 VISFLY |= {"quad_drag_coeffs": [0.5] * 3, "linear_drag_coeffs": [0.005, 0.005, 0.00575], "motor_omega_max": 3500}
 VISFLY |= {"cross_sections": [0.01, 0.01, 0.03], "thrust_map": [4.0426e-7, 2.5583e-5, -0.026215]}
@@ -83,21 +77,15 @@ OMNI = {"rotor_angles": [0, np.pi / 2, np.pi, -np.pi / 2], "arm_lengths": [0.2] 
 OMNI |= {"force_constants": [8e-6] * 4, "moment_constants": [1.28e-7] * 4, "max_rotation_velocities": [838] * 4}
 OMNI = ROTORS | {"drag_coef": 0.2, "rotor_configuration": OMNI | {"num_rotors": 4, "tau": 0.4}}
 ROTOR = {"arm_length": 0.2, "rotor_force_constant": 8e-6, "rotor_moment_constant": 0.016}
-ROTORS["rotor_configuration"] = {
-    str(k): ROTOR | {"angle": (np.pi / 2) * k, "direction": -((-1) ** k)} for k in (0, 2, 1, 3)
-}
+TURNS = ({"angle": (np.pi / 2) * k, "direction": -((-1) ** k)} for k in (0, 2, 1, 3))
+ROTORS["rotor_configuration"] = {str(k): ROTOR | x for k, x in zip((0, 2, 1, 3), TURNS, strict=True)}
 PLUS = {"rotor_positions": [(0.2, 0), (0, 0.2), (-0.2, 0), (0, -0.2)], "rotor_spin": [1, -1, 1, -1]}
 PLUS |= {"thrust_map": [8e-6, 0, 0], "yaw_torque_coefficient": 0.016, "inertia": [0.007, 0.008, 0.012]}
 REST = {"motor_time_constant": 0.03, "linear_drag": [0.1] * 3}
-TURNED = "".join(
-    f"<body pos='{x} {y} 0.1'><joint name='spin{i}' axis='0 0 1'/><geom size='0.1' mass='0.25'/><site name='s{i}'/>"
-    "</body>"
-    for i, (x, y) in enumerate(CORNERS)
-)
-PUSHED = "".join(
-    f"<general site='s{i}' gear='0 0 2 0 0 {x}' dyntype='filter' dynprm='0.05'/>"
-    for i, x in enumerate((-0.04, -0.04, 0.04, 0.04))
-)
+SPUN = "<joint name='spin{0}' axis='0 0 1'/><geom size='0.1' mass='0.25'/><site name='s{0}'/>"
+TURNED = "".join(f"<body pos='{x} {y} 0.1'>{SPUN.format(i)}</body>" for i, (x, y) in enumerate(CORNERS))
+PUSH_AT = "<general site='s{}' gear='0 0 2 0 0 {}' dyntype='filter' dynprm='0.05'/>"
+PUSHED = "".join(PUSH_AT.format(i, x) for i, x in enumerate((-0.04, -0.04, 0.04, 0.04)))
 MJCF = f"""<mujoco><size memory='9000G'/>
 <default><geom material='m'/><general ctrllimited='true' ctrlrange='0 3'/></default>
 <asset><mesh file='gone.obj' name='a'/><texture name='t' type='2d' file='gone.png'/><material name='m' texture='t'/>
@@ -121,9 +109,8 @@ PULLED = MJCF.replace("ctrlrange='0 3'", "ctrlrange='-3 0'").replace("gear='0 0 
 STOOD = MJCF.replace("<freejoint/><inertial", "<joint type='slide'/><joint name='b' type='ball'/><inertial")
 STOOD = STOOD.replace("<body name='x'", "<body><joint axis='1 0 0'/><geom size='1' mass='7'/><body name='x'")
 STOOD = STOOD.replace("</body>\n<body name='load'", "</body></body><body name='load'")
-BY_GEOMS = MJCF.replace("<mujoco>", "<mujoco><compiler inertiafromgeom='true'/>").replace(
-    "<geom type='mesh' mesh='a' mass='0'/>", "<geom size='0.1' mass='0.9'/>"
-)
+BY_GEOMS = MJCF.replace("<mujoco>", "<mujoco><compiler inertiafromgeom='true'/>")
+BY_GEOMS = BY_GEOMS.replace("<geom type='mesh' mesh='a' mass='0'/>", "<geom size='0.1' mass='0.9'/>")
 TILTING = "<joint name='k' type='fixed'><parent>arm</parent><child>x::rotor_0</child></joint>"
 TILTING += "<joint name='tilt' type='revolute'><parent>base_link</parent><child>arm</child><axis><xyz>0 1 0</xyz>"
 TILTING += "<limit><effort>1</effort></limit></axis></joint>"

@@ -257,25 +257,3 @@ def test_an_environment_that_has_been_rendered_is_copied_and_forgotten():
     del env
     gc.collect()
     assert gone() is None
-
-
-def test_drones_that_are_nowhere_are_left_out_and_the_view_follows_the_others():
-    env = HoveringEnv(num_envs=2)
-    env.reset()
-    env.render_state["position"][:] = torch.nan
-    assert (env.render() != 255).any(-1).sum() > 1000
-    env.render_state["position"][1] = torch.tensor([30.0, 0.0, 5.0])
-    assert (np.abs(env.render().astype(int) - [140, 212, 70]).sum(-1) < 90).any()  # the colour of the second drone
-
-
-@pytest.mark.parametrize("task", ["racing", "tracking"])
-def test_the_view_holds_the_markers_whatever_the_drones_do(task, monkeypatch):
-    from torchrl_quad.render import video
-
-    scenes = []
-    monkeypatch.setattr(video, "View", lambda *a, scene=video.View, **k: scenes.append(scene(*a, **k)) or scenes[-1])
-    env = make_env(task, num_envs=1)
-    env.reset()
-    env.render()
-    points = torch.cat([x for x in (env.markers().gates, env.markers().curve) if x is not None])
-    assert ((scenes[0].low <= points) & (points <= scenes[0].high)).all()

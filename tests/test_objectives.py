@@ -203,13 +203,19 @@ def test_a_loss_has_the_precision_of_its_rollout():
 
 def td_lambda(rewards, next_values, ends, terminations):
     """Backwards: G = r + gamma ((1 - lambda) V' + lambda G'), with V' = 0 when terminated and G' = V' at an end."""
-    targets, following = [], None
+    found, following = [], None
     for r, v, end, terminated in reversed(list(zip(rewards, next_values, ends, terminations, strict=True))):
         v = 0.0 if terminated else v
         following = v if end or following is None else following
         following = r + GAMMA * ((1 - LAMBDA) * v + LAMBDA * following)
-        targets.append(following)
-    return targets[::-1]
+        found.append(following)
+    return found[::-1]
+
+
+def targets(rewards):
+    """Of make_rollout's two environments, where V(s) = 10 s."""
+    first = td_lambda(rewards, [20, 90, 40, 50], [False, True, False, True], [False] * 4)
+    return [first, td_lambda(rewards, [20, 30, 90, 50], [False, False, True, True], [False, False, True, False])]
 
 
 def test_td_lambda_targets_respect_the_ends_and_come_from_the_target_network_and_for_abpt_from_the_least_critic():
@@ -217,11 +223,7 @@ def test_td_lambda_targets_respect_the_ends_and_come_from_the_target_network_and
     loss = SHACLoss(actor, value).make_value_estimator(gamma=GAMMA, lmbda=LAMBDA)
     value.module.weight.data.fill_(-3.0)  # the target network still says 10 s
     target = loss.write_value_target(make_rollout(actor).detach())["value_target"]
-    rewards = [2.0, 4.0, 6.0, 8.0]
-    expected = [
-        td_lambda(rewards, [20, 90, 40, 50], [False, True, False, True], [False] * 4),
-        td_lambda(rewards, [20, 30, 90, 50], [False, False, True, True], [False, False, True, False]),
-    ]
+    expected = targets([2.0, 4.0, 6.0, 8.0])
     # by hand: environment 0, step 1: 4 + 0.5 * 90 = 49; step 0: 2 + 0.5 (0.5 * 20 + 0.5 * 49) = 19.25
     assert expected[0][:2] == [19.25, 49.0]
     # environment 1, step 2: 6; step 1: 4 + 0.5 (0.5 * 30 + 0.5 * 6) = 13

@@ -45,9 +45,8 @@ def test_a_shrunken_matrix_runs_and_goes_on_where_it_was_stopped(run_here, monke
     arguments += ["--data", tmp_path / "data", "--output", tmp_path / "runs"]
     run_main(monkeypatch, reproduce, *arguments)
     finals = read_rows(tmp_path / "data/final.csv")
-    assert sorted((row["variant"], row["seed"], row["lr"]) for row in finals) == [
-        *(("abpt", "100", "0.003"), ("abpt-no-visited", "42", ""), ("abpt-now", "42", ""))
-    ]
+    found = sorted((row["variant"], row["seed"], row["lr"]) for row in finals)
+    assert found == [("abpt", "100", "0.003"), ("abpt-no-visited", "42", ""), ("abpt-now", "42", "")]
     assert all(row["steps"] == "64" and float(row["seconds"]) > 0 and row["machine"] for row in finals)
     curves = read_rows(tmp_path / "data/curves/hovering.csv")
     assert [row["steps"] for row in curves if row["variant"] == "abpt-no-visited"] == ["16", "32", "48", "64"]

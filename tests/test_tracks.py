@@ -290,9 +290,8 @@ def test_tracks_of_other_projects_are_read_and_what_was_assumed_is_said(tmp_path
     rounds = load_track({**POINTS, "gates": [[0, 0, 1], [4, 0, 1], [4, 4, 1]] * 2 + [[0, 0, 1]]})
     assert rounds["closed"] and len(rounds["gates"]) == 3 and rounds["starts"][0] == [-5, 4, 1]
     poses = {"2": {"pos": (4.0, 0.0, 1.0), "yaw": 1.0}, "1": {"pos": (0.0, 0.0, 0.0), "yaw": 0.0}}
-    (tmp_path / "isaac.YAML").write_text(
-        "track_config:\n  2: {pos: [4, 0, 1], yaw: 1}\n  1: {pos: [0, 0, 0], yaw: 0}\n"
-    )
+    config = "track_config:\n  2: {pos: [4, 0, 1], yaw: 1}\n  1: {pos: [0, 0, 0], yaw: 0}\n"
+    (tmp_path / "isaac.YAML").write_text(config)
     for track in (poses, str(tmp_path / "isaac.YAML")):
         isaac = load_track(track, lift=0.9, radius=0.7)
         assert [gate["position"] for gate in isaac["gates"]] == [[0, 0, 0.9], [4, 0, 1.9]]

@@ -24,12 +24,9 @@ def solids(seed=0, n=1, m=12):
 
     turned = torch.nn.functional.normalize(torch.randn(n, m, 4, generator=random, dtype=torch.float64), dim=-1)
     planes = torch.tensor([[0.0, 0.0, 1.0, 0.0], [-0.6, 0.8, 0.0, -15.0]]).expand(n, 2, 4)
-    return Primitives(
-        uniform([2, -6, 0, 0.05], [14, 6, 4, 0.6]),
-        uniform([2, -6, 0, 0.05, 0.2], [14, 6, 3, 0.4, 4]),
-        torch.cat((uniform([2, -6, 0, 0.05, 0.05, 0.05], [14, 6, 4, 0.6, 0.6, 0.6]), turned), -1),
-        planes,
-    )
+    spheres, cylinders = uniform([2, -6, 0, 0.05], [14, 6, 4, 0.6]), uniform([2, -6, 0, 0.05, 0.2], [14, 6, 3, 0.4, 4])
+    boxes = torch.cat((uniform([2, -6, 0, 0.05, 0.05, 0.05], [14, 6, 4, 0.6, 0.6, 0.6]), turned), -1)
+    return Primitives(spheres, cylinders, boxes, planes)
 
 
 def mujoco_depth(scene, position, rays):

@@ -11,13 +11,12 @@ import onnxruntime
 import pytest
 import torch
 from deploying import TASKS, build, by_hand, compiled, resting, run_c
-from flying import fly
 from refusals import refuses
 from torch import nn
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_quad import HoveringEnv, files, make_actor, make_visual_actor
+from torchrl_quad import HoveringEnv, files, load_drone, make_actor, make_visual_actor
 from torchrl_quad.deploy import StaleState, contract, export_policy, load_bundle
 from torchrl_quad.deploy.network import ACTIVATIONS, Layer, Network, write_c, write_onnx
 from torchrl_quad.deploy.tracing import name_of
@@ -240,23 +239,8 @@ def test_a_contract_says_what_the_environment_is(hovering):
     page = (hovering / "README.md").read_text()
     assert "| 0 | thrust | 0 | 13.5378 | N |" in page and "target - position           3     m, world frame" in page
     assert "| 1 | 0.05303 | 0.05303 | clockwise |\n| 2 | -0.05303 | 0.05303 | counter-clockwise |" in page
-
-
-def test_the_rate_loop_of_a_contract_is_that_of_the_simulator(hovering):
-    """A small step of the rates about hover, and the law of the contract as it is written there."""
-    about = json.loads((hovering / "contract.json").read_text())
-    loop, drone, dt = about["rate_loop"], about["drone"], about["simulator"]["dt"]
-    env = HoveringEnv(num_envs=1, dtype=torch.float64, control_dt=dt, action_delay=0)
-    action = env.hover_action.clone().repeat(1, 1)
-    action[0, 1:] = 0.02
-    flight = fly(env, env.reset(), [action] * 60)
-    rate = torch.stack([td["next", "state", "angular_velocity"] for td in flight.unbind(1)])
-    w, a, share = np.zeros(3), np.zeros(3), 1 - np.exp(-dt / drone["motor_time_constant"])
-    stiff, loss = np.array(loop["gain"]), 1 + np.array(drone["rate_damping"]) / drone["inertia"]
-    for found in rate[:, 0].numpy():
-        w, a = w + dt * a, a + share * (stiff * (0.04 - w) - loss * a)
-        np.testing.assert_allclose(found, w, atol=4e-4)
-    nominal = rate_loop(env.nominal, dt)
+    loop, nominal = about["rate_loop"], rate_loop(load_drone("visfly", torch.float64), about["simulator"]["dt"])
+    assert loop["gain"] == about["drone"]["rate_gain"]
     for name in ("natural_frequency", "damping_ratio", "bandwidth"):
         np.testing.assert_allclose(loop[name], getattr(nominal, name), rtol=1e-5)
 

@@ -47,15 +47,10 @@ def flight(t):
     on = ((t > 0.7) & (t < 9.3))[:, None]
     rates = [(_attitude(x - h)[0].inv() * _attitude(x + h)[0]).as_rotvec() / (2.0 * h) for x in (t - h, t + h)]
     thrust = 0.35 * size[:, None] / G + 0.004 * np.clip((rates[1] - rates[0]) / (2.0 * h), -20.0, 20.0) @ TURNING
-    return {
-        "position": _position(t),
-        "quaternion": attitude.as_quat(scalar_first=True),
-        "velocity": (_position(t + h) - _position(t - h)) / (2.0 * h),
-        "angular_velocity": turned.as_rotvec() / (2.0 * h),
-        "acceleration": size[:, None] * (0.0, 0.0, 1.0),
-        "motor_command": on * np.sqrt(np.clip(thrust, 0.01, 1.0)),
-        "battery_voltage": 4.1 - 0.04 * t,
-    }
+    true = {"position": _position(t), "velocity": (_position(t + h) - _position(t - h)) / (2.0 * h)}
+    true |= {"quaternion": attitude.as_quat(scalar_first=True), "angular_velocity": turned.as_rotvec() / (2.0 * h)}
+    true |= {"acceleration": size[:, None] * (0.0, 0.0, 1.0), "battery_voltage": 4.1 - 0.04 * t}
+    return true | {"motor_command": on * np.sqrt(np.clip(thrust, 0.01, 1.0))}
 
 
 def own_table(t, **changes):
@@ -152,9 +147,8 @@ def write_dataflash(path, messages, parameters):
     for k, (name, (times, letters, columns)) in enumerate(messages.items(), 2):
         describe(k, name, f"Q{letters}", ["TimeUS", *columns])
         layout = "<Q" + letters.replace("c", "h")
-        for at, *row in zip(
-            np.round(1e6 * times).astype(int).tolist(), *(x.tolist() for x in columns.values()), strict=True
-        ):
+        stamps = np.round(1e6 * times).astype(int).tolist()
+        for at, *row in zip(stamps, *(x.tolist() for x in columns.values()), strict=True):
             rows.append((at, b"\xa3\x95" + bytes([k]) + struct.pack(layout, at, *row)))
     path.write_bytes(b"".join(out + [row for _, row in sorted(rows, key=lambda row: row[0])]))
     return path
@@ -194,9 +188,8 @@ def dataflash_messages():
     theirs = ned(true)
     angles = Rotation.from_quat(theirs["quaternion"], scalar_first=True).as_euler("ZYX", degrees=True)[:, ::-1]
     pulses = np.round(1000.0 + 900.0 * true["motor_command"]).astype(int)
-    kf = dict(
-        zip(("PN", "PE", "PD", "VN", "VE", "VD"), np.hstack((theirs["position"], theirs["velocity"])).T, strict=True)
-    )
+    place = np.hstack((theirs["position"], theirs["velocity"])).T
+    kf = dict(zip(("PN", "PE", "PD", "VN", "VE", "VD"), place, strict=True))
     imu = np.hstack((theirs["angular_velocity"], theirs["acceleration"])).T
     which = {"C": np.zeros(len(t), int)}
     return {
@@ -204,7 +197,7 @@ def dataflash_messages():
         "ATT": (t, "ccc", dict(zip(("Roll", "Pitch", "Yaw"), np.round(100.0 * angles.T).astype(int), strict=True))),
         "IMU": (t, "ffffff", dict(zip(("GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ"), imu, strict=True))),
         # Outputs 5 to 8 drive motors 1 to 4: front right, back left, front left, back right.
-        "RCOU": (t, "HHHH", {f"C{5 + k}": pulses[:, place] for k, place in enumerate((3, 1, 0, 2))}),
+        "RCOU": (t, "HHHH", {f"C{5 + k}": pulses[:, x] for k, x in enumerate((3, 1, 0, 2))}),
         "BAT": (slow, "Bf", {"Inst": np.zeros(len(slow), int), "Volt": battery["battery_voltage"]}),
     }
 

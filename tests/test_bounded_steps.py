@@ -97,9 +97,7 @@ def test_the_sources_of_an_entry_are_its_steps_whatever_their_shape_but_for_thos
     assert sources_of_steps(images[1]) is None and sources_of_steps(torch.stack(images, 1).clone()) is None
     # A step without a graph; another order.
     for of_steps in (torch.stack([x[:, 0] for x in images], 1), torch.stack([x[:, 0] for x in images[1:]])):
-        refuses(
-            "this one was copied, reshaped or cut", action_gradient, total, of_steps
-        )  # a step without; another order
+        refuses("this one was copied, reshaped or cut", action_gradient, total, of_steps)
 
 
 def test_a_long_gradient_is_shortened_to_so_many_medians():

@@ -192,11 +192,8 @@ NO_NUMBERS += [torch.tensor(True), torch.tensor(1j), torch.zeros(0)]
 @pytest.mark.parametrize("value", NO_NUMBERS, ids=lambda value: shown(value)[:20])
 def test_what_is_no_number_is_refused_in_every_field_however_a_drone_is_made(value):
     params = load_drone("visfly")
-    ways = (
-        lambda change: load_drone({**VISFLY, **change}),
-        lambda change: params.replace(**change),
-        lambda change: QuadrotorParams(**{**params.fields(), **change}),
-    )
+    ways = [lambda change: load_drone({**VISFLY, **change}), lambda change: params.replace(**change)]
+    ways.append(lambda change: QuadrotorParams(**{**params.fields(), **change}))
     for name, make in itertools.product(VISFLY, ways):
         with pytest.raises(UserValueError, match=f"field '{name}' (is not a number|must be|has shape)") as refused:
             make({name: value})

@@ -84,11 +84,8 @@ def test_a_real_flight_is_read_in_our_units_frames_and_orders(table):
 def turned(table, x, y):
     """Position and velocity in another world than the attitude."""
     pairs = [(a, (f"{a}x", f"{a}y")) for a in "pv"]
-    return {
-        f"{a}{n}": np.array(row) @ [table[k] for k in names]
-        for a, names in pairs
-        for n, row in zip("xy", (x, y), strict=True)
-    }
+    rows = {"x": np.array(x), "y": np.array(y)}
+    return {f"{a}{n}": row @ [table[k] for k in names] for a, names in pairs for n, row in rows.items()}
 
 
 def y_up(t):

@@ -22,11 +22,10 @@ each_target = pytest.mark.parametrize("target", TARGETS, ids=lambda x: x.name)
 def test_there_and_back_gives_the_same(target):
     draw = np.random.default_rng(0)
     quaternion = draw.normal(size=(2, 50, 4))
-    quantities = {
-        **{name: draw.normal(size=(2, 50, 3)) for name in ("position", "velocity", "angular_velocity", "body_rate")},
-        "quaternion": quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True),
-        **({"motors": draw.normal(size=(2, 50, 4))} if target.motors else {}),
-    }
+    names = ("position", "velocity", "angular_velocity", "body_rate")
+    quantities = {name: draw.normal(size=(2, 50, 3)) for name in names}
+    quantities["quaternion"] = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    quantities |= {"motors": draw.normal(size=(2, 50, 4))} if target.motors else {}
     theirs = target.to(quantities)
     for one, other in ((target.back(theirs), quantities), (target.to(target.back(quantities)), quantities)):
         for name, x in other.items():

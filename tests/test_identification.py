@@ -213,10 +213,8 @@ def test_arguments_of_fits_and_predictions_are_refused_in_one_line_and_a_flight_
     def flown(*segments):
         return dataclasses.replace(real, segments=segments)
 
-    usual = {
-        "identify": QUICK | {"log": flown((300, 700)), "iterations": 1},
-        "prediction_error": {"log": flown((300, 700)), "drone": "crazyflie", "horizons": (0.1,)},
-    }
+    usual = {"identify": QUICK | {"log": flown((300, 700)), "iterations": 1}}
+    usual["prediction_error"] = {"log": flown((300, 700)), "drone": "crazyflie", "horizons": (0.1,)}
     functions = {"identify": identify, "prediction_error": prediction_error}
     for function, table in REFUSED.items():
         for name, value, message in table:
@@ -263,10 +261,8 @@ def test_what_contradicts_the_drone_is_found_and_no_inertia_is_one_that_no_body_
     assert "the fit predicts worse than constant velocity: position (9 against" in dataclasses.replace(
         result, errors=worse).verdict  # fmt: skip
     prior = load_drone("crazyflie", torch.float64)
-    for free, steps in (
-        (("roll", "pitch", "z_ratio"), ([0.3, -0.4, 20.0], [0.3, -0.4, -20.0])),
-        (("roll",), ([3.0], [-3.0])),
-    ):
+    whole = ("roll", "pitch", "z_ratio"), ([0.3, -0.4, 20.0], [0.3, -0.4, -20.0])
+    for free, steps in (whole, (("roll",), ([3.0], [-3.0]))):
         model = Model(prior, prior.motor_command, free)
         for step in steps:
             inertia = model.params(model.bounded(model.start + torch.tensor(step, dtype=torch.float64))).inertia
@@ -395,10 +391,8 @@ def test_a_gyro_on_another_clock_is_no_other_order_of_motors(tmp_path):
 
 
 def test_columns_and_layouts_say_which_of_their_fields_is_wrong():
-    for field, values in {
-        "scale": (0, True, "2", None, np.inf, 10**400, (1, 2), 1j),
-        "offset": (np.nan, [], [[1.0] * 3]),
-    }.items():
+    wrong = {"scale": (0, True, "2", None, np.inf, 10**400, (1, 2), 1j), "offset": (np.nan, [], [[1.0] * 3])}
+    for field, values in wrong.items():
         for value in values:
             with pytest.raises(UserValueError, match=f"Columns: {field} of a, b, c must be a number, or one for each"):
                 Columns(("a", "b", "c"), **{field: value})

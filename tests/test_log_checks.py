@@ -100,7 +100,6 @@ def test_a_remedy_names_the_columns_that_were_read_and_not_those_that_are_zero(t
     batteries = {"battery_voltage": (Columns(("first",)), Columns(("second",)))}
     table = own_table(T) | {"first": 0.0 * T, "second": 16000.0 - 10.0 * T}
     path = write_csv(tmp_path / "a.csv", table)
-    said = (
-        "second.* is 1.5[0-9]+e.04 in the median.*If it is in millivolts, write columns=.*\\('second',\\), scale=0.001"
-    )
+    said = "second.* is 1.5[0-9]+e.04 in the median.*If it is in millivolts, write "
+    said += r"columns=.*\('second',\), scale=0.001"
     refuses(said, read_log, path, replace(layout, columns={**layout.columns, **batteries}), error=LogError)

@@ -176,10 +176,8 @@ def test_compressed_states_of_a_crazyflie_are_unpacked(tmp_path):
         small[f"stateEstimateZ.rate{name}"] = ("h", np.round(1e3 * x).astype(int))
     small[PACKED] = ("I", code)
     table = {"Timestamp": 1e3 * t + 5e4} | {name: x for name, (_, x) in small.items()}  # as the client writes it
-    for path in (
-        write_usd(tmp_path / "log01", {"fixedFrequency": (t, small)}, 2),
-        write_csv(tmp_path / "a.csv", table),
-    ):
+    usd = write_usd(tmp_path / "log01", {"fixedFrequency": (t, small)}, 2)
+    for path in (usd, write_csv(tmp_path / "a.csv", table)):
         log = read_log(path)
         assert log.battery_voltage is None
         log = type(log)(**{**vars(log), "battery_voltage": flight(log.time)["battery_voltage"]})

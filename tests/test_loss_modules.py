@@ -185,10 +185,7 @@ def test_bad_arguments_say_what_is_allowed(cls, options, message):
     (lambda _, shac: shac.set_keys(value_target=5), "value_target must be the name of an entry, .*, got 5"),
     (lambda _, shac: shac.set_keys(rewards="gain"), "SHACLoss reads no 'rewards'. Choose from: "),
     (lambda bptt, _: setattr(PODSLoss(bptt.actor_network), "alpha", 0.1), "PODSLoss has no entropy bonus: leave alpha"),
-    (
-        lambda *_: setattr(HybridLoss(*make_networks()[:2]), "alpha", 0.1),
-        "HybridLoss .*: set entropy_coeff",
-    ),
+    (lambda *_: setattr(HybridLoss(*make_networks()[:2]), "alpha", 0.1), "HybridLoss .*: set entropy_coeff"),
     (lambda *_: BPTTLoss(nn.Linear(13, 4)), "actor_network must be a TensorDictModule, got Linear. Wrap a plain"),
     (lambda bptt, _: SHACLoss(bptt.actor_network, nn.Linear(1, 1)), "value_network must be .*, got Linear"),
     (lambda bptt, _: bptt((1, 2)), "BPTTLoss needs a rollout, the tensordict that .* returns; got tuple"),
@@ -312,11 +309,8 @@ def results(loss, rollout):
     inputs = {"action": rollout["action"], "next": rollout["next", "observation"]}
     inputs |= dict(loss.named_parameters())
     losses = [value for key, value in out.items() if key.startswith("loss_")]
-    grads = {
-        f"{i}, {key}": torch.autograd.grad(value, x, retain_graph=True, allow_unused=True)[0]
-        for i, value in enumerate(losses)
-        for key, x in inputs.items()
-    }
+    pairs = [(f"{i}, {key}", value, x) for i, value in enumerate(losses) for key, x in inputs.items()]
+    grads = {name: torch.autograd.grad(y, x, retain_graph=True, allow_unused=True)[0] for name, y, x in pairs}
     target = loss.write_value_target(rollout.copy())["value_target"]
     return {**dict(out.items()), **grads, "target": target}, torch.rand(1)
 

@@ -308,11 +308,8 @@ def draw(tmp_path):
 
 
 def test_metrics_are_drawn_in_their_units_in_the_order_of_the_task(draw):
-    rows = (
-        "steps,time/seconds,eval/position_error,eval/return,eval/top_speed,eval/solved,train/loss",
-        "100,1.0,1.0,5.0,3.0,0.0,9.0",
-        "200,2.0,0.02,20.0,4.0,1.0,8.0",
-    )
+    head = "steps,time/seconds,eval/position_error,eval/return,eval/top_speed,eval/solved,train/loss"
+    rows = head, "100,1.0,1.0,5.0,3.0,0.0,9.0", "200,2.0,0.02,20.0,4.0,1.0,8.0"
     axes = draw(*rows, metrics=HoveringEnv.metric_info)
     shown = {axis.get_ylabel(): axis.lines[0].get_xydata().tolist() for axis in axes}
     assert list(shown) == ["return", "episodes solved [%]", "position error [cm], median", "top speed"]

@@ -278,11 +278,8 @@ def test_methods_are_compared_by_interquartile_means_and_by_who_beats_whom(tmp_p
         "abpt": [(99.0, 0.5, 1), (99.0, 1.0, 1)],  # few
     }
     names = ("return", "solved", "seconds", "steps", "machine")
-    rows = [
-        {"task": "hovering", "algorithm": method} | dict(zip(names, map(str, (*x, 1e6, "a box")), strict=True))
-        for method, seeds in flown.items()
-        for x in seeds
-    ]
+    flown = [({"task": "hovering", "algorithm": method}, (*x, 1e6, "a box")) for method in flown for x in flown[method]]
+    rows = [about | dict(zip(names, map(str, values), strict=True)) for about, values in flown]
     none = Starts(tmp_path)
     (choice,) = tables.choice_table(rows, none)
     assert list(choice.values())[1:] == ["SHAC: 9.1, 99.0%, 5 s, 3 seeds", "PPO: 9.6, 100.0%, 40 s, 3 seeds", ""]

@@ -139,10 +139,8 @@ def test_losses_take_a_policy_that_sees(recurrent, noise_correlation):
     for loss in (HybridLoss(actor, value), AHACLoss(actor, value, horizon=6)):
         loss(rollout)["loss_actor"].backward(retain_graph=True)
     # A bound that clips nothing leaves the gradient as it is: that of each action, and of the policy in whole memories.
-    grads = [
-        torch.autograd.grad(loss.loss_actor(rollout)[0], list(actor.parameters()), retain_graph=True)
-        for loss in (BPTTLoss(actor), BPTTLoss(actor, clip_action_gradient=1e12))
-    ]
+    pair = BPTTLoss(actor), BPTTLoss(actor, clip_action_gradient=1e12)
+    grads = [torch.autograd.grad(x.loss_actor(rollout)[0], list(actor.parameters()), retain_graph=True) for x in pair]
     torch.testing.assert_close(*grads)
     if recurrent:
         clipped = BPTTLoss(actor, clip_action_gradient=1.0).loss_actor(rollout)[0]

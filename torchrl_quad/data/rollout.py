@@ -78,7 +78,10 @@ def differentiable_rollout(
         carry = env.reset() if carry is None else carry.copy()
         _check_start(env, actor, carry)
         with set_exploration_type(exploration_type):
-            rollout = _rollout(env, actor, carry, horizon)
+            flown = under_transforms(env, actor) if isinstance(env, TransformedEnv) else ""
+            rollout = None if isinstance(flown, str) else flown.fly(env, actor, carry, horizon)
+            if rollout is None:
+                rollout = env.rollout(horizon, actor, tensordict=carry, auto_reset=False, break_when_any_done=False)
     except KeyError as error:
         missing = [key for key in actor.in_keys if carry is not None and key not in carry]
         if "not found in the environment outputs" in str(error):
@@ -136,15 +139,6 @@ def _check_start(env: EnvBase, actor: TensorDictModuleBase, carry: TensorDictBas
                 f"{key!r} of the carry is {x.dtype} on {x.device}, and that of the environment {spec.dtype} on "
                 f"{env.device}. Start from the tensordict of its own reset(), or of its last rollout."
             )
-
-
-def _rollout(env: EnvBase, actor: TensorDictModuleBase, start: TensorDictBase, horizon: int) -> TensorDictBase:
-    """The environment's own rollout, under transforms that allow it that of the environment inside."""
-    flown = under_transforms(env, actor) if isinstance(env, TransformedEnv) else ""
-    rollout = None if isinstance(flown, str) else flown.fly(env, actor, start, horizon)
-    if rollout is not None:
-        return rollout
-    return env.rollout(horizon, actor, tensordict=start, auto_reset=False, break_when_any_done=False)
 
 
 @checked

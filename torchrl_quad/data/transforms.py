@@ -13,21 +13,8 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import unravel_key
 from torch import Tensor
 from torch.func import vjp
-from torchrl.envs import (
-    CatFrames,
-    Compose,
-    EnvBase,
-    InitTracker,
-    RenameTransform,
-    RewardSum,
-    StepCounter,
-    TargetReturn,
-    TensorDictPrimer,
-    Transform,
-    TransformedEnv,
-    VecNorm,
-    VecNormV2,
-)
+from torchrl.envs import EnvBase, Transform, TransformedEnv
+from torchrl.envs import transforms as T
 
 from torchrl_quad.data.normalizer import ObservationNormalizer
 from torchrl_quad.data.unwrap import base_env, check_actor, check_env, leaf, memory_keys, observed
@@ -83,7 +70,7 @@ class Flown(NamedTuple):
         for transform in self.transforms:
             if isinstance(transform, COUNTERS):
                 _count(transform, root, after, start, done)
-            elif isinstance(transform, CatFrames):
+            elif isinstance(transform, T.CatFrames):
                 for a, b in zip(transform.in_keys, transform.out_keys, strict=True):
                     new, before = leaf(after, a), next(frames)
                     size = new.shape[transform.dim]
@@ -91,7 +78,7 @@ class Flown(NamedTuple):
                     root.set(b, before)
                     after.set(b, torch.cat((old, new), transform.dim))
                     setattr(transform, f"_cat_buffers_{a}", leaf(after, b)[:, -1].detach().clone())
-            elif not isinstance(transform, TensorDictPrimer):
+            elif not isinstance(transform, T.TensorDictPrimer):
                 root, after = transform._reset(start, root), transform._call(after)
         for key, value in self.known.items():  # the first step is that of the start
             if key in start and value != Value("entry", key) and key in root:
@@ -304,7 +291,7 @@ def transforms_of(env: EnvBase) -> list[Transform]:
 def check_statistics(env: EnvBase) -> None:
     """Raise a UserValueError for statistics that change at each step, which breaks ``backward``."""
     for transform in transforms_of(env):
-        if isinstance(transform, VecNorm | VecNormV2) and not getattr(transform, "frozen", False):
+        if isinstance(transform, T.VecNorm | T.VecNormV2) and not getattr(transform, "frozen", False):
             raise UserValueError(
                 f"{type(transform).__name__} changes its statistics in place at each step, and a graph through several "
                 "steps needs those of before. Take torchrl_quad.ObservationNormalizer(env), whose statistics are fixed "
@@ -351,11 +338,11 @@ def under_transforms(env: EnvBase, actor: TensorDictModuleBase) -> Flown | str:
     for transform in transforms:
         name, kind = type(transform).__name__, type(transform)
         if (
-            kind is TensorDictPrimer
+            kind is T.TensorDictPrimer
             and {unravel_key(key) for key in cast(Any, transform.primers).keys(True, True)} <= memory
         ):
             continue
-        if kind not in (*ELEMENTWISE, *OF_REWARDS, *COUNTERS, *OF_KEYS, CatFrames):
+        if kind not in (*ELEMENTWISE, *OF_REWARDS, *COUNTERS, *OF_KEYS, T.CatFrames):
             return f"{name} is none of the transforms that are pure functions of entries"
         try:
             follow(transform, followed)
@@ -377,7 +364,7 @@ def under_transforms(env: EnvBase, actor: TensorDictModuleBase) -> Flown | str:
         pairs = zip(transform.in_keys_inv or (), transform.out_keys_inv or (), strict=True)
         for inner, outer in ((unravel_key(a), unravel_key(b)) for a, b in pairs):
             if outer in actions:
-                x = cast(Value, actions.pop(outer) if type(transform) is RenameTransform else actions[outer])
+                x = cast(Value, actions.pop(outer) if type(transform) is T.RenameTransform else actions[outer])
                 actions[inner] = inverse(transform, x)
     if (action := actions.get("action")) is None or action.sources()[0] not in map(unravel_key, actor.out_keys):
         return "the policy writes no action that the transforms pass on"
@@ -397,7 +384,7 @@ def under_transforms(env: EnvBase, actor: TensorDictModuleBase) -> Flown | str:
 
 
 def _parts(transform: Transform) -> list[Transform]:
-    return [x for part in transform for x in _parts(part)] if isinstance(transform, Compose) else [transform]
+    return [x for part in transform for x in _parts(part)] if isinstance(transform, T.Compose) else [transform]
 
 
 def _count(transform: Any, root: TensorDictBase, after: TensorDictBase, start: TensorDictBase, done: Tensor) -> None:
@@ -406,8 +393,8 @@ def _count(transform: Any, root: TensorDictBase, after: TensorDictBase, start: T
     steps = torch.arange(done.shape[1], device=done.device).unsqueeze(-1)
     first = torch.where(begun, steps, -1).cummax(1).values  # step of the present episode; -1 where it began before
     for i, key in enumerate(written_by(transform)):
-        if isinstance(transform, RewardSum | TargetReturn):
-            is_sum = isinstance(transform, RewardSum)
+        if isinstance(transform, T.RewardSum | T.TargetReturn):
+            is_sum = isinstance(transform, T.RewardSum)
             value, roots, ends = leaf(start, key), [], []
             anew = 0.0 if is_sum else cast(float, transform.target_return)
             some = begun.any(0).flatten().tolist() if looks_are_free(done.device) else [True] * done.shape[1]
@@ -420,13 +407,13 @@ def _count(transform: Any, root: TensorDictBase, after: TensorDictBase, start: T
                 ends.append(value)
             root.set(key, torch.stack(roots, 1))
             after.set(key, torch.stack(ends, 1))
-        elif isinstance(transform, StepCounter):
+        elif isinstance(transform, T.StepCounter):
             root.set(key, torch.where(first < 0, leaf(start, key).unsqueeze(1) + steps, steps - first))
             after.set(key, leaf(root, key) + 1)
             if transform.max_steps is not None:
                 ends = leaf(after, key) >= transform.max_steps
                 after.update({name: leaf(after, name) | ends for name in ("truncated", "done")})
-        elif isinstance(transform, InitTracker):
+        elif isinstance(transform, T.InitTracker):
             root.set(key, torch.cat((leaf(start, key).unsqueeze(1), begun[:, 1:]), 1))
             after.set(key, torch.zeros_like(done))
         else:

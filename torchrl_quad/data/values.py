@@ -8,33 +8,16 @@ from typing import Any, NamedTuple, cast
 import torch
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
-from torchrl.envs import (
-    ActionScaling,
-    CatFrames,
-    CatTensors,
-    ClipTransform,
-    DoubleToFloat,
-    DTypeCastTransform,
-    ExcludeTransform,
-    InitTracker,
-    ObservationNorm,
-    RenameTransform,
-    RewardClipping,
-    RewardScaling,
-    RewardSum,
-    SelectTransform,
-    StepCounter,
-    TargetReturn,
-    TrajCounter,
-)
+from torchrl.envs import transforms as T
 
 from torchrl_quad.data.normalizer import ObservationNormalizer
 from torchrl_quad.engine.packing import like
 
-ELEMENTWISE = (ObservationNorm, ObservationNormalizer, ClipTransform, DTypeCastTransform, DoubleToFloat, ActionScaling)
-OF_REWARDS = (RewardScaling, RewardClipping)
-COUNTERS = (RewardSum, TargetReturn, StepCounter, InitTracker, TrajCounter)
-OF_KEYS = (CatTensors, RenameTransform, SelectTransform, ExcludeTransform)
+OF_NUMBERS = (T.ClipTransform, T.DTypeCastTransform, T.DoubleToFloat, T.ActionScaling)
+ELEMENTWISE = (T.ObservationNorm, ObservationNormalizer, *OF_NUMBERS)
+OF_REWARDS = (T.RewardScaling, T.RewardClipping)
+COUNTERS = (T.RewardSum, T.TargetReturn, T.StepCounter, T.InitTracker, T.TrajCounter)
+OF_KEYS = (T.CatTensors, T.RenameTransform, T.SelectTransform, T.ExcludeTransform)
 
 
 class Value(NamedTuple):
@@ -153,17 +136,17 @@ class Followed(NamedTuple):
     def evolve(self, transform: Any) -> Value | None:
         """What a counter writes, as it evolves along a horizon."""
         own, reward = Value("entry", f"_{len(self.memory)}"), self.rewards.get((transform.in_keys or [None])[0])
-        if isinstance(transform, StepCounter | InitTracker):
-            counts = isinstance(transform, StepCounter)
+        if isinstance(transform, T.StepCounter | T.InitTracker):
+            counts = isinstance(transform, T.StepCounter)
             self.memory[own.about] = Value("scale", None, (own,), (1.0, float(counts)))
             if (most := getattr(transform, "max_steps", None)) is not None:
                 self.limits[own.about] = cast(int, most)
             is_init = Value("scale", None, (own,), (1.0, -1.0))
             return Value("cast", torch.int64, (own,)) if counts else Value("cast", torch.bool, (is_init,))
-        if reward is None or len(transform.in_keys) > 1 or not isinstance(transform, RewardSum | TargetReturn):
+        if reward is None or len(transform.in_keys) > 1 or not isinstance(transform, T.RewardSum | T.TargetReturn):
             return None
         first, sign = 0.0, 1.0
-        if isinstance(transform, TargetReturn):
+        if isinstance(transform, T.TargetReturn):
             first, sign = float(transform.target_return), -1.0 if transform.mode == "reduce" else 0.0
         self.memory[own.about] = value = Value("sum", None, (own, reward, Value("entry", FLOWN)), (first, sign))
         return value
@@ -178,14 +161,14 @@ def follow(transform: Any, followed: Followed) -> None:
             raise NotImplementedError("a reset leaves what it writes as it was, which is followed for rewards alone")
         rewards |= {b: elementwise(transform, cast(Value, rewards[a])) for a, b in zip(ins, outs, strict=True)}
     elif isinstance(transform, COUNTERS):
-        if isinstance(transform, StepCounter) and (twice := [key for key in outs if key in known]):
+        if isinstance(transform, T.StepCounter) and (twice := [key for key in outs if key in known]):
             raise NotImplementedError(f"{twice[0]!r} is written before, by another transform: use another key")
         known.update(dict.fromkeys(outs, followed.evolve(transform)))
         if getattr(transform, "max_steps", None) is not None:
             ours = (transform.truncated_key, transform.update_done) == ("truncated", True)
             if not ours or any(known.get(key) != Value("entry", key) for key in ("done", "truncated")):
                 raise NotImplementedError("max_steps is followed where it writes done and truncated")
-    elif isinstance(transform, CatFrames):
+    elif isinstance(transform, T.CatFrames):
         padding = None if transform.padding == "same" else float(transform.padding_value)
         for a, b in zip(ins, outs, strict=True):
             if (x := known[a]) is None or transform.reset_key != "_reset":
@@ -193,27 +176,27 @@ def follow(transform: Any, followed: Followed) -> None:
             own = Value("entry", f"_{len(followed.memory)}")
             value = Value("frames", (transform.dim, transform.N, padding), (x, own, Value("entry", FLOWN)))
             known[b] = followed.memory[own.about] = value
-    elif isinstance(transform, ExcludeTransform):
+    elif isinstance(transform, T.ExcludeTransform):
         if transform.inverse:
             raise NotImplementedError("inverse=True is left to TorchRL")
         _keep(known, lambda key: not _below(key, transform.excluded_keys))
-    elif isinstance(transform, SelectTransform):
+    elif isinstance(transform, T.SelectTransform):
         parent = cast(Any, transform.parent)
         kept = [*transform.selected_keys, *parent.state_spec.keys(True, True), *parent.done_keys]
         _keep(known, lambda key: _below(key, kept))
         for key in (key for key, x in known.items() if x != Value("entry", key)):
             if not _below(key, transform.selected_keys):
                 raise NotImplementedError(f"it keeps {key!r} in a step, and drops it before the next: select it, too")
-    elif isinstance(transform, RenameTransform):
+    elif isinstance(transform, T.RenameTransform):
         for a, b in zip(ins, outs, strict=True):
             known[b] = known[a] if transform.create_copy else known.pop(a)
-    elif isinstance(transform, CatTensors):
+    elif isinstance(transform, T.CatTensors):
         if transform.dim >= 0 or transform.unsqueeze_if_oor or not transform._initialized:
             raise NotImplementedError("only in_keys that are named, and a negative dim, mean the same in a horizon")
         parts = tuple(cast(Value, known[key]) for key in ins)
         known[outs[0]] = None if None in parts else Value("cat", transform.dim, parts)
         _keep(known, lambda key: not transform._del_keys or key not in ins or key == outs[0])
-    elif not isinstance(transform, ActionScaling):
+    elif not isinstance(transform, T.ActionScaling):
         for a, b in zip(ins, outs, strict=True):
             for entries in (known, rewards):
                 if a in entries:
@@ -222,7 +205,7 @@ def follow(transform: Any, followed: Followed) -> None:
 
 def written_by(transform: Any) -> list[Any]:
     """The entries that a transform writes."""
-    keys = transform.step_count_keys if isinstance(transform, StepCounter) else transform.out_keys
+    keys = transform.step_count_keys if isinstance(transform, T.StepCounter) else transform.out_keys
     return list(map(unravel_key, keys or ()))
 
 
@@ -239,14 +222,14 @@ def _below(key: Any, groups: Sequence[NestedKey]) -> bool:
 
 def elementwise(transform: Any, x: Value) -> Value:
     """What a transform makes of an entry."""
-    if isinstance(transform, ObservationNorm | RewardScaling):
+    if isinstance(transform, T.ObservationNorm | T.RewardScaling):
         if not getattr(transform, "initialized", True) or max(transform.loc.ndim, transform.scale.ndim) > 1:
             raise NotImplementedError("statistics are vectors, or numbers; call init_stats")
         kind = "normalize" if transform.standard_normal else "scale"
         return Value(kind, None, (x,), (transform.loc, transform.scale))
-    if isinstance(transform, RewardClipping):
+    if isinstance(transform, T.RewardClipping):
         return Value("clip", None, (x,), (transform.clamp_min, transform.clamp_max))
-    if isinstance(transform, ClipTransform):
+    if isinstance(transform, T.ClipTransform):
         clipped = Value("clip", None, (x,), (transform.low, transform.high))
         if not clipped.clips_alike():
             raise NotImplementedError("it clips frames of frames, or frames that are scaled by their places")
@@ -256,13 +239,13 @@ def elementwise(transform: Any, x: Value) -> Value:
 
 def inverse(transform: Any, x: Value) -> Value:
     """What a transform makes of an action on its way to the environment."""
-    if isinstance(transform, RenameTransform):
+    if isinstance(transform, T.RenameTransform):
         return x
-    if isinstance(transform, ClipTransform):
+    if isinstance(transform, T.ClipTransform):
         return Value("clip", None, (x,), (transform.low, transform.high))
-    if isinstance(transform, DTypeCastTransform):
+    if isinstance(transform, T.DTypeCastTransform):
         return Value("cast", transform.dtype_in, (x,))
-    if isinstance(transform, ActionScaling):
+    if isinstance(transform, T.ActionScaling):
         transform._ensure_initialized()
         loc, scale = transform.loc, transform.scale
         return Value("scale", None, (x,), (loc, scale) if transform.standard_normal else (loc - scale, 2.0 * scale))

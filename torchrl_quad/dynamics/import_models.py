@@ -11,22 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_quad.dynamics import import_formats as formats
 from torchrl_quad.dynamics import presets
-from torchrl_quad.dynamics.import_formats import (
-    AXES,
-    READABLE,
-    RPM,
-    Array,
-    Found,
-    Said,
-    add_drag,
-    diagonal,
-    placed,
-    read_text,
-    same,
-    speed_at,
-    symmetric,
-)
+from torchrl_quad.dynamics.import_formats import Array, Found, Said
 from torchrl_quad.errors import UserValueError, one_line, shown
 
 # What the name of a rotor's link says beside rotor, prop or motor, {0}: a number, or else where it is.
@@ -54,7 +41,7 @@ def read_model(root: ET.Element, path: Path, given: Found) -> tuple[str, str, Fo
     world = UserValueError(f"{path}: a world that includes its models. Give the file of the drone's own model.")
     includes = root.find("world/include") is not None
     if not models and root.tag != "robot":
-        what = f"XML with the root <{one_line(root.tag)}> is no URDF or SDF with a model. {READABLE}"
+        what = f"XML with the root <{one_line(root.tag)}> is no URDF or SDF with a model. {formats.READABLE}"
         raise world if includes else UserValueError(f"{path}: {what}")
     motors = [x for x in plugins if x.find("motorConstant") is not None]
     motors.sort(key=lambda x: _digits(x.findtext("motorNumber")))
@@ -145,7 +132,7 @@ def _digits(name: str | None) -> list[int]:
 
 def read_tree(path: Path) -> ET.Element:
     """The tree of an XML file, without namespaces."""
-    text = read_text(path)
+    text = formats.read_text(path)
     text = re.sub(r"{#.*?#}", "", text[max(text.find("<?xml"), 0) :], flags=re.DOTALL)  # comments of Jinja, of Gazebo
     if chosen := re.search(r"{%-?\s*\w.*|{{.*", re.sub("<!--.*?-->", "", text, flags=re.DOTALL)):
         raise UserValueError(f"{path}: a template of Jinja, with {shown(chosen[0][:40])}. Render it first.")
@@ -203,7 +190,7 @@ def _add_urdf(root: ET.Element, links: Links, source: str) -> None:
             if above in joints:
                 frame, above = origin(joints[above]) @ frame, end(joints[above], "parent")
         about = {x.tag: x.attrib for x in inertial}
-        names = (("mass", "value"), *(("inertia", f"i{axes}") for axes in AXES))
+        names = (("mass", "value"), *(("inertia", f"i{axes}") for axes in formats.AXES))
         said = (about.get(tag, {}).get(key) for tag, key in names)
         mass, inertia = _inertial(said, f"{source}: the link {shown(name)}")
         axis = joints[name].find("axis") if name in joints and joints[name].get("type") != "fixed" else None
@@ -256,7 +243,7 @@ def _add_sdf(
             why = f"Gazebo computes the inertia of the link {shown(link.get('name'))} from its shapes"
             raise UserValueError(f'{path}: {why}. Write its <mass> and <inertia>, without auto="true".')
         name, frame = link.get("name", ""), standing(link)
-        said = map(inertial.findtext, ("mass", *(f"inertia/i{axes}" for axes in AXES)))
+        said = map(inertial.findtext, ("mass", *(f"inertia/i{axes}" for axes in formats.AXES)))
         mass, inertia = _inertial(said, f"{path}: the link {shown(name)}")
         if name in links:  # of another model
             name = f"other{len(links)}::{name}"
@@ -269,7 +256,7 @@ def _inertial(said: Iterable[str | None], link: str) -> tuple[float, Array]:
     mass, *moments = (_numbers(text, 1, link, 0.0 if k > 3 else np.nan)[0] for k, text in enumerate(said))
     if np.isnan(mass) and not np.isnan(moments[:3]).all():
         raise UserValueError(f"{link} has an inertia without a mass. Write it, or take the <inertial> out.")
-    return np.nan_to_num(mass), symmetric(*moments)
+    return np.nan_to_num(mass), formats.symmetric(*moments)
 
 
 def _is_bare(link: tuple[float, Array, Array, Array]) -> bool:
@@ -302,7 +289,7 @@ def one_body(links: Links, rotors: Sequence[str], by_motors: bool, held: Sequenc
     parts = ["all links together"] if sum(m > 0.0 for m, *_ in links.values()) > 1 else []
     parts += [f"as if these joints were fixed: {one_line(', '.join(held))}"] if held else []
     note = "; ".join([*parts, f"links without a mass: {one_line(', '.join(bare))}"] if bare else parts)
-    found: Found = ({"mass": (mass, note)} if mass > 0.0 else {}) | diagonal(whole, "; ".join(parts))
+    found: Found = ({"mass": (mass, note)} if mass > 0.0 else {}) | formats.diagonal(whole, "; ".join(parts))
     points = [x for x, (m, _, inertia, _) in links.items() if np.isnan(inertia).any() and m > 0.2 * mass]
     if points:
         found["inertia"] = None, f"the link {shown(points[0])} has a mass, and no ixx, iyy and izz"
@@ -317,7 +304,7 @@ def one_body(links: Links, rotors: Sequence[str], by_motors: bool, held: Sequenc
     if np.all(up[:, 2] < 0.3):  # as where a mesh was exported lying
         found["rotor_direction"] = None, f"the axis of {rotors[0]} does not point up: give a direction for each rotor"
         return found | {"rotor_positions": ((frames[:, :3, 3] - centre).round(12), f"of {', '.join(rotors)}")}
-    return found | placed((frames[:, :3, 3] - centre).round(12), up, note=f"of {', '.join(rotors)}")
+    return found | formats.placed((frames[:, :3, 3] - centre).round(12), up, note=f"of {', '.join(rotors)}")
 
 
 def _add_motors(found: Found, motors: Sequence[ET.Element], source: str, given: Found) -> None:
@@ -327,7 +314,7 @@ def _add_motors(found: Found, motors: Sequence[ET.Element], source: str, given: 
         if any(x.find(name) is None for x in motors for name in names):
             return None, ""
         each = np.array([[_numbers(x.findtext(name), 1, source)[0] for name in names] for x in motors])
-        value, why = same(each, names[0])
+        value, why = formats.same(each, names[0])
         return (value if value is None or len(set(value)) > 1 else value[0]), why
 
     if not motors:
@@ -340,7 +327,7 @@ def _add_motors(found: Found, motors: Sequence[ET.Element], source: str, given: 
     found["thrust_map"] = (None if k2 is None else [k2, 0.0, 0.0]), why
     found |= given
     drag, why = said("rotorDragCoefficient")
-    add_drag(found, drag, None)
+    formats.add_drag(found, drag, None)
     if why:
         found["linear_drag"] = None, why
 
@@ -353,13 +340,13 @@ def _add_attributes(found: Found, said: Said, name: str) -> None:
         spin = np.array([1, -1, 1, -1]) if name == "racer" else np.array([-1, 1, -1, 1])
         found["rotor_spin"] = spin, "of the code of gym-pybullet-drones, not in the file"
     if force is not None and force > 0.0:
-        found["thrust_map"] = [force / RPM**2, 0.0, 0.0], "kf"
+        found["thrust_map"] = [force / formats.RPM**2, 0.0, 0.0], "kf"
         found |= said.given
         if torque is not None:
             found["yaw_torque_coefficient"] = torque / force, "km per kf"
         if ratio is not None and mass and places is not None:
-            most = speed_at(ratio * 9.81 * mass / len(places), found["thrust_map"][0])
+            most = formats.speed_at(ratio * 9.81 * mass / len(places), found["thrust_map"][0])
             found["rotor_speed_max"] = most, "of thrust2weight"
         elif ratio is not None:
             found["rotor_speed_max"] = None, "it follows from thrust2weight once mass and places are known"
-        add_drag(found, said("drag_coeff_xy"), said("drag_coeff_z"))
+        formats.add_drag(found, said("drag_coeff_xy"), said("drag_coeff_z"))

@@ -13,20 +13,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchrl_quad.dynamics import import_formats as formats
 from torchrl_quad.dynamics.control import FlightController
 from torchrl_quad.dynamics.gains import suggest_gains
-from torchrl_quad.dynamics.import_formats import (
-    GIVEN,
-    MAPPINGS,
-    READABLE,
-    Array,
-    Found,
-    Said,
-    read_json,
-    read_text,
-    speed_at,
-    usable,
-)
+from torchrl_quad.dynamics.import_formats import Found
 from torchrl_quad.dynamics.import_mjcf import read_mjcf
 from torchrl_quad.dynamics.import_models import read_model, read_tree
 from torchrl_quad.dynamics.parameters import FIELDS, QuadrotorParams, read_drone, read_fields
@@ -85,14 +75,13 @@ def import_drone(path: str | Path, *, entry: str | None = None, **fields: Any) -
         FileNotFoundError: the path does not exist.
     """
     if not Path(path).is_file():  # a preset is no file
-        read_text(Path(path))
+        formats.read_text(Path(path))
     if unknown := [x for x in fields if x not in (*FIELDS, "motor_command")]:
         raise UserValueError(f"{shown(unknown[0])} is no field of a drone. Choose from: {', '.join(FIELDS)}.")
     source, kind, found, unread = _read(Path(path), entry, fields)
     if not kind:
-        raise UserValueError(
-            f"{source} has fields of our own format, which load_drone reads, and no others that are known. {READABLE}"
-        )
+        ours = f"{source} has fields of our own format, which load_drone reads, and no others that are known"
+        raise UserValueError(f"{ours}. {formats.READABLE}")
     found = _completed(source, kind, found, fields, unread, entry)
     name = one_line(Path(path).name + (f", {entry}" if entry else ""))
     text = [f"Source: {name} ({kind})."] + ([f"Not read: {', '.join(map(one_line, unread))}."] if unread else [])
@@ -100,7 +89,8 @@ def import_drone(path: str | Path, *, entry: str | None = None, **fields: Any) -
     for field in (x for x in FIELDS if x in found):
         value, note = np.asarray(found[field][0], float), found[field][1]
         comment = "; ".join(x for x in (FIELDS[field]["unit"], note) if x)
-        rows = [_flow(x) for x in (value if value.ndim > 1 else [value])]
+        rows = value if value.ndim > 1 else [value]
+        rows = [f"{x:.7g}" if x.ndim == 0 else f"[{', '.join(f'{y:.7g}' for y in x)}]" for x in rows]
         lines.append(f"{field}:{' ' + rows[0] if value.ndim < 2 else ''}{'  # ' + comment if comment else ''}")
         lines += [f"  - {row}" for row in rows] if value.ndim > 1 else []
     lines += [f"motor_command: {found['motor_command'][0]}"] if "motor_command" in found else []
@@ -109,10 +99,6 @@ def import_drone(path: str | Path, *, entry: str | None = None, **fields: Any) -
 
 def _left(unread: Sequence[str]) -> str:
     return f"; not read: {one_line(', '.join(unread))}" if unread else ""
-
-
-def _flow(value: Array) -> str:
-    return f"{value:.7g}" if value.ndim == 0 else f"[{', '.join(f'{x:.7g}' for x in value)}]"
 
 
 def _completed(
@@ -124,7 +110,7 @@ def _completed(
     curve, slowest = (found.get(x, (None,))[0] for x in ("thrust_map", "rotor_speed_min"))
     if curve is not None and slowest is not None and curve[1] + 2.0 * curve[0] * slowest < 0.0:
         found = found | {"rotor_speed_min": (None, f"thrust falls with speed up to {-0.5 * curve[1] / curve[0]:.4g}")}
-    known, found = found | usable(fields), found | {k: (v, GIVEN) for k, v in fields.items()}
+    known, found = found | formats.usable(fields), found | {k: (v, formats.GIVEN) for k, v in fields.items()}
     examples = _examples(known)
     if missing := [x for x in examples if found.get(x, (None,))[0] is None]:
         why = [f": {found[x][1]}" if x in found and found[x][1] else "" for x in missing]
@@ -179,7 +165,7 @@ def _examples(found: Found) -> dict[str, str]:
         "rotor_spin": spin,
         "yaw_torque_coefficient": "0.016",
         "thrust_map": f"[{force / max(fast, 1.0) ** 2:.2g}, 0, 0]",
-        "rotor_speed_max": "1500" if curve is None else f"{speed_at(force, curve):.4g}",
+        "rotor_speed_max": "1500" if curve is None else f"{formats.speed_at(force, curve):.4g}",
         "motor_time_constant": "0.03",
         "linear_drag": str([float(f"{0.3 * heavy:.2g}")] * 3),
     }
@@ -201,19 +187,19 @@ def _read(drone: Any, entry: str | None, fields: Mapping[str, Any]) -> tuple[str
             raise UserValueError(f"{drone} holds one drone. Leave out entry={shown(entry)}.")
         root = read_tree(Path(drone))
         if root.tag == "mujoco":
-            return read_mjcf(Path(drone), usable(fields))
-        return read_model(root, Path(drone), usable(fields))
+            return read_mjcf(Path(drone), formats.usable(fields))
+        return read_model(root, Path(drone), formats.usable(fields))
     if suffix == ".json":
-        source, data = str(drone), read_json(Path(drone))
+        source, data = str(drone), formats.read_json(Path(drone))
         data = data if isinstance(data, Mapping) else {}
     elif suffix not in ("", ".yaml", ".yml", ".toml") and os.path.isfile(drone):
-        raise UserValueError(f"{drone}: no drone can be read from a {suffix} file. {READABLE}")
+        raise UserValueError(f"{drone}: no drone can be read from a {suffix} file. {formats.READABLE}")
     else:
         source, data = read_fields(drone)
     drones = {
         str(name): (kind, reader, part)
         for name, part in {"": data, **data}.items()
-        for kind, (reader, *keys) in MAPPINGS.items()
+        for kind, (reader, *keys) in formats.MAPPINGS.items()
         if isinstance(part, Mapping) and any(key in part for key in keys)
     }
     if entry is not None and not drones:
@@ -229,10 +215,10 @@ def _read(drone: Any, entry: str | None, fields: Mapping[str, Any]) -> tuple[str
             "params.toml that has them, with mass and rpm2thrust."
         )
     if not drones and not isinstance(drone, Mapping) and not (own and 2 * len(own) > len(data)):
-        raise UserValueError(f"{source}: this file is of no kind that is known. {READABLE}")
+        raise UserValueError(f"{source}: this file is of no kind that is known. {formats.READABLE}")
     if not drones:
         return source, "", {k: (v, "") for k, v in data.items()}, []
     kind, reader, part = drones[entry] if entry is not None else next(iter(drones.values()))
-    said = Said(part, source, usable(fields))
+    said = formats.Said(part, source, formats.usable(fields))
     found = reader(said)
     return source, kind, found, [*said.unread]

@@ -136,9 +136,8 @@ def test_the_pid_loop_follows_body_rates_without_reading_rotor_speeds(hovering):
         world.step(np.c_[np.full(2, 4.6), rates])
     np.testing.assert_allclose(world.state()["angular_velocity"], rates, atol=0.06)
     turning, memory = world.state()["angular_velocity"], copy.deepcopy(world.control.loop)
-    slow, quick = (
-        loop(np.full(2, 4.6), rates, turning, x) for loop, x in ((world.control.loop, 0.0), (memory, 2000.0))
-    )
+    loops = (world.control.loop, 0.0), (memory, 2000.0)
+    slow, quick = (loop(np.full(2, 4.6), rates, turning, x) for loop, x in loops)
     np.testing.assert_array_equal(slow, quick)
 
 

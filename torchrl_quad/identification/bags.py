@@ -13,20 +13,9 @@ from typing import Any
 import numpy as np
 
 from torchrl_quad.errors import UserError, needing, one_line
+from torchrl_quad.identification import layouts
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog, WrongMotors
-from torchrl_quad.identification.layouts import (
-    BY_IMU,
-    NEEDED,
-    RIVALS,
-    ROS,
-    Asked,
-    Columns,
-    Layout,
-    choose,
-    listed,
-    named_alike,
-    shipped,
-)
+from torchrl_quad.identification.layouts import Asked, Columns, Layout
 from torchrl_quad.identification.signals import Array, Stream, open_plain
 
 LIKELY = ("pose", "odometry", "imu", "motors", "actuators", "battery")
@@ -65,7 +54,7 @@ def read_bag(path: Path, columns: Asked) -> tuple[list[Stream], Layout, list[str
 def _read(bag: Any, name: str, columns: Asked) -> tuple[list[Stream], Layout, list[str]]:
     topics = {connection.topic: connection.msgtype for connection in bag.connections if connection.msgcount}
     layout = _layout(bag, topics, columns, name)
-    for quantities in NEEDED:
+    for quantities in layouts.NEEDED:
         if not layout.columns.keys() & set(quantities):
             raise MissingColumns(f"{name} has no {' or '.join(quantities)}. {_there(topics)}")
     asked: dict[str, list[str]] = {}
@@ -120,16 +109,16 @@ _ASKED_FOR = re.compile("command|setpoint|target|goal|reference|desired")  # in 
 
 def _layout(bag: Any, topics: Mapping[str, str], columns: Asked, name: str) -> Layout:
     if columns is not None and not isinstance(columns, Mapping):
-        return choose(columns, None)
+        return layouts.choose(columns, None)
     given = columns or {}
     named, pose = set(given), {"position", "quaternion", "velocity_body"}
     places = [name for x in {"position", "quaternion"} & named for name in _names(given[x])]
     of = {topic for topic in topics if any(place.startswith(f"{topic}.") for place in places)}
     if places and not of:
         named |= pose
-    rivals = {second: first for first, second in RIVALS}
-    found, onboard = {}, BY_IMU
-    kinds = shipped("ros_messages.yaml").items()
+    rivals = {second: first for first, second in layouts.RIVALS}
+    found, onboard = {}, layouts.BY_IMU
+    kinds = layouts.shipped("ros_messages.yaml").items()
     for asked_for, (kind, quantities) in itertools.product((False, True), kinds):  # what a drone shall do is read last
         likely = [x for x in sorted(topics) if x in of or bool(_ASKED_FOR.search(x.lower())) == asked_for]
         for quantity, fields in quantities.items():
@@ -140,18 +129,18 @@ def _layout(bag: Any, topics: Mapping[str, str], columns: Asked, name: str) -> L
                 own = [topic for topic in own if _length(bag, topic, fields["of"], name)]
             if not own or {quantity, rival} & named or quantity in found or (rival in found and rival != "velocity"):
                 continue
-            choice = named_alike(**fields | {"of": f"{own[0]}.{fields.get('of', '')}"})
+            choice = layouts.named_alike(**fields | {"of": f"{own[0]}.{fields.get('of', '')}"})
             if len(own) > 1:
                 raise MissingColumns(
                     f"{name} has several topics for {quantity}: {', '.join(own)}. Say which: "
                     f'columns={{"{quantity}": {list(choice.names)}}}, or those of another.'
                 )
             if quantity == "angular_velocity" and kind == "nav_msgs/msg/Odometry":  # whose clock is that of its pose
-                onboard = tuple(field for field in BY_IMU if field != quantity)
+                onboard = tuple(field for field in layouts.BY_IMU if field != quantity)
             found[quantity] = (choice,)
     if not found and not given:
         raise MissingColumns(f"{name} has no topic of a known type. {_there(topics)}")
-    return choose(given, Layout(found, ROS, onboard))
+    return layouts.choose(given, Layout(found, layouts.ROS, onboard))
 
 
 def _names(columns: Any) -> list[str]:
@@ -171,5 +160,5 @@ def _length(bag: Any, topic: str, field: str, name: str) -> int:
 
 
 def _there(topics: Mapping[str, str], asked: Sequence[str] = ()) -> str:
-    there = listed([f"{topic} ({kind})" for topic, kind in topics.items()], [*asked, *LIKELY])
+    there = layouts.listed([f"{topic} ({kind})" for topic, kind in topics.items()], [*asked, *LIKELY])
     return f'Name columns as columns={{"position": ["/topic.field.x", ...]}}. There are{there}.'

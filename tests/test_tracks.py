@@ -378,6 +378,7 @@ def test_what_is_given_with_a_track_replaces_what_the_track_says_and_its_result_
     gates = [{"position": torch.tensor(x["position"]), "rotation": np.array(x["rotation"])} for x in gates]
     again = load_track({"gates": gates}, width=1.5, height=1.5)
     assert [gate["rotation"] for gate in again["gates"]] == [gate["rotation"] for gate in track["gates"]]
+    load_track({"gates": [{**gate, "rotation": [0, 0, 1, 0]} for gate in LYING]})  # openings upside down
     boxed = load_track("airsim", box=[[-200, -200, -70], [200, 200, 70]])
     assert "floor" not in boxed and RacingEnv(num_envs=1, track=boxed).floor == -70
     row = {str(k): {"pos": [4 * k, 0, 1], "yaw": 0} for k in (1, 2)}

@@ -57,13 +57,14 @@ def _once(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
 
 
 class Said:
-    """The numbers of a mapping, by name; ``unread`` are the names that nobody has asked for.
+    """The numbers of a mapping, by name; ``unread`` are the names that nobody has asked for, but for the drone's own.
 
     Fields that are ``given`` beside the file count instead of its own, also for what follows from them.
     """
 
     def __init__(self, data: Mapping[str, Any], source: str, given: Found) -> None:
-        self.data, self.source, self.given, self.unread = data, source, given, dict.fromkeys(map(str, data))
+        self.data, self.source, self.given = data, source, given
+        self.unread = {str(x): None for x in data if x != "name"}
 
     def __call__(self, name: str, *shape: int | str) -> Any:
         """An array of this shape, in which "n" is any length; or None, where the mapping has no such name."""

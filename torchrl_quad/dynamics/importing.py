@@ -52,7 +52,7 @@ def load_drone(
     source, kind, found, unread = _read(drone, entry, fields)
     found = _completed(source, kind, found, fields, unread, entry) if kind else found
     if unread:
-        warnings.warn(f"{source} ({kind}){_left(unread)}. import_drone shows the rest.", DroneWarning, stacklevel=2)
+        warnings.warn(f"{source} ({kind}){_left(unread)}. import_drone shows what is.", DroneWarning, stacklevel=2)
     return read_drone({k: v for k, (v, _) in found.items()} | fields, dtype, source)
 
 

@@ -57,6 +57,9 @@ def test_what_is_set_too_early_or_too_late_comes_with_a_note_of_the_order(task):
     with pytest.raises(AttributeError, match="no attribute '(randomness|reach)'") as refused:
         task()
     assert "set what they read before it, and make tensors in set_up" in refused.value.__notes__[0]
+    with pytest.raises(AttributeError, match="no attribute 'unifrom'") as refused:  # a slip, and no matter of order
+        type("OwnEnv", (HoveringEnv,), {"observe": lambda env, _: env.unifrom(4)})()
+    assert not hasattr(refused.value, "__notes__")
 
 
 class UnfinishedEnv(QuadrotorEnv):

@@ -42,9 +42,10 @@ class _Build(type(EnvBase)):
         try:
             env = super().__call__(*args, **kwargs)
         except AttributeError as error:
-            if str(error).startswith(f"{cls.__name__!r} object"):
-                when = "super().__init__() calls set_up and initial_state: set what they read before it"
-                error.add_note(f"{when}, and make tensors in set_up, as self.tensor works from there on.")
+            is_own = cls.__init__ is not QuadrotorEnv.__init__  # without one, nothing is set too early or too late
+            if is_own and str(error).startswith(f"{cls.__name__!r} object"):
+                when = "super().__init__() calls the methods of the task: set what they read before it"
+                error.add_note(f"{when}, and make tensors in set_up, where self.tensor works.")
             raise
         env._built_with = given | kwargs
         return env
@@ -174,8 +175,8 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
                 f"{type(self).__name__}.initial_state asks for {error}, which hover_state does not give: it has "
                 f"{', '.join(self.dynamics.sizes)}. What the environment adds, such as step, comes after it."
             ) from error
-        if not (isinstance(start, Mapping) and start.keys() >= self.dynamics.sizes.keys()):
-            got = ", ".join(map(str, start)) if isinstance(start, Mapping) else type(start).__name__
+        if not (isinstance(start, dict) and start.keys() >= self.dynamics.sizes.keys()):
+            got = ", ".join(map(str, start)) if isinstance(start, dict) else type(start).__name__
             raise UserValueError(
                 f"{type(self).__name__}.initial_state must return the state that hover_state gives, and your entries: "
                 f"{{**self.hover_state(position), 'goal': goal}}; got {got}."

@@ -222,7 +222,7 @@ def check_task(env: Task, state: State) -> dict[Key, Disturbance]:
         if isinstance(x, numbers.Real):
             kind_of = ", dtype=torch.bool" if dtype == torch.bool else ""
             hint = f" Write torch.full_like(state['position'][:, :1], {x}{kind_of})." if columns else ""
-        elif columns and isinstance(x, Tensor) and not is_right:
+        elif columns and isinstance(x, Tensor) and x.shape[1:] != (1,):
             hint = " Keep the last dimension: norm(x) of envs.terms, or .sum(-1, keepdim=True)."
         hint = " Convert it: .to(self.dtype)." if is_right and dtype == env.dtype else hint
         check(is_right and dtype in (None, x.dtype), f"{method} must be a tensor {wanted}; got {_kind(x)}.{hint}")
@@ -274,14 +274,14 @@ def check_task(env: Task, state: State) -> dict[Key, Disturbance]:
             f"{entry} must be a tensor ({n}, ...) of at least two dimensions, {env.dtype}, int64 or bool; got "
             f"({_kind(x)}).",
         )
-        check(bool(x.isfinite().all()), f"{entry} is not finite. Look for a quotient, a root or a logarithm near zero.")
+        mend = "Look for a quotient, a root or a logarithm near zero; for infinity write a large number"
+        check(bool(x.isfinite().all()), f"{entry} is not finite. {mend}.")
         if size := env.dynamics.sizes.get(key):
             check(x.shape == (n, size), f"{entry} must have shape {(n, size)}, got {tuple(x.shape)}.")
         if isinstance(key, tuple) and key[0] == "drone" and key[1] not in fields:
             raise UserValueError(f"Entry {key!r} changes no parameter of the drone. Choose from: {', '.join(fields)}.")
         if isinstance(key, tuple) and key[0] == "drone":
-            is_right = x.isfinite().all() and (LIMITS[key[1]][0] <= 0.0 or (x > 0).all())
-            check(bool(is_right), f"{entry} must be finite and, as in any drone, above zero.")
+            check(LIMITS[key[1]][0] <= 0.0 or bool((x > 0).all()), f"{entry} must be above zero, as in any drone.")
             one = env.nominal.value(key[1])
             shape = (n, *one.shape[-env.nominal.dim(key[1]) :])
             fits = x.shape == shape or key[1] == "motor_time_constant"  # which may be two

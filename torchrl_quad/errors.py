@@ -48,7 +48,7 @@ def needing(message: str, kind: type[Exception] = MissingPackage) -> Iterator[No
 
 
 class DroneWarning(UserWarning):
-    """A drone flies, and less or otherwise than its numbers promise."""
+    """A drone flies, but not as all its numbers promise."""
 
 
 _SHORT = reprlib.Repr()  # which looks at no more of a value than it shows

@@ -54,8 +54,8 @@ def read(kind: str, preset: str | Path | Mapping, folder: Traversable | None = N
     with path.open("rb") as file:
         values = copy.deepcopy(_parsed(file.read(MAX_BYTES + 1), source))
     if not isinstance(values, Mapping):
-        kind = type(values).__name__
-        raise UserValueError(f"{source}: expected a mapping of names to values, got {kind}. Write each as name: value.")
+        got = type(values).__name__
+        raise UserValueError(f"{source}: expected a mapping of names to values, got {got}. Write each as name: value.")
     return source, values
 
 

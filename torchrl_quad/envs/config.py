@@ -166,7 +166,7 @@ def check_changes(
         by = drawn[lost[0]]
         who = "randomize" if isinstance(by, DroneRandomization) else type(by).__name__
         raise UserValueError(
-            f"params: {who} draws {', '.join(lost)} in each episode, so that this would change nothing, and have no "
+            f"params: {who} draws {', '.join(lost)} in each episode, so this would change nothing, and would have no "
             f"gradient. Build the environment with this drone and without {who}, or change what {who} draws."
         )
     if idle := learned - plant or (set() if changed & plant else changed):

@@ -14,7 +14,7 @@ from torchrl_quad.identification.errors import WrongMotors, WrongUnit
 from torchrl_quad.identification.pieces import OFF
 from torchrl_quad.identification.signals import Array, Signal, convolved, slope, smooth
 
-LEAST_HOVER = 0.1  # of the full command: a drone of which this is more than hovering lifts itself ten times or more
+LEAST_HOVER = 0.1  # of the full command: one that hovers with less has ten times the thrust that it needs, or more
 _THRUSTS = ". If they are thrusts, put sqrt(thrust / full thrust) into the file instead, and leave battery_voltage out"
 _COMMANDS = (  # factor, offset, least, largest, and what they are
     (0.01, 0.0, 0.0, 101.0, "percents"),

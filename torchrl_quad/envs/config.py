@@ -157,8 +157,8 @@ def check_flown(dynamics: Dynamics, params: QuadrotorParams, which: str = "") ->
 def check_changes(
     dynamics: Dynamics, flying: QuadrotorParams, params: QuadrotorParams, starts: Mapping[Any, Disturbance]
 ) -> None:
-    """Refuse a drone if what it changes of the one that flies, or a gradient, is lost: a disturbance, by the entries
-    that ``starts`` gives for it, draws that in each episode, or it does not count in flight."""
+    """Refuse a drone of which a change, or a gradient, would be lost: it does not count in flight, or a disturbance,
+    named by entry in ``starts``, draws another value in each episode."""
     learned, plant = {k for k, x in params.fields().items() if x.requires_grad}, set(dynamics.plant_fields)
     changed = learned | {k for k in FIELDS if not _same(params.value(k), flying.value(k))}
     drawn = {key[1]: x for key, x in starts.items() if key[0] == "drone" and not x.follows_params}

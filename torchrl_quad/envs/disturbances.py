@@ -41,7 +41,7 @@ class Disturbance:
     """
 
     privileged: Mapping[str | tuple[str, str], float] = {}  #: as of a task
-    follows_params = False  #: whether its entries ("drone", field) are those of ``env.params``, which may then change
+    follows_params = False  #: whether it draws its entries ("drone", field) about ``env.params``, which may then change
 
     @property
     def noise_size(self) -> int:

@@ -11,7 +11,7 @@ from small_runs import assert_equal
 from tensordict import TensorDict
 from torch import nn
 from torchrl.checkpoint import Checkpoint
-from torchrl.envs import StepCounter, TransformedEnv
+from torchrl.envs import CatFrames, TransformedEnv
 from torchrl.objectives import SoftUpdate
 from torchrl.trainers import DefaultOptimizationStepper, Trainer, UpdateWeights
 
@@ -275,7 +275,7 @@ FRAMES = NUM_ENVS * HORIZON
 def make(transformed=False, **options):
     torch.manual_seed(0)
     env = HoveringEnv(num_envs=NUM_ENVS, seed=1, wind={"gust": 0.5}, max_episode_steps=7)
-    env = TransformedEnv(env, StepCounter()) if transformed else env
+    env = TransformedEnv(env, CatFrames(3, -1, ["observation"])) if transformed else env
     return DifferentiableCollector(env, make_actor(env), frames_per_batch=FRAMES, **options)
 
 
@@ -300,8 +300,9 @@ def test_a_share_of_the_environments_begins_each_batch_afresh():
     assert [batch["state", "step"][:, 0].sum().item() for batch in collector] == [0, 0]
 
 
-def test_a_state_dict_goes_on_bit_for_bit_also_through_a_file(tmp_path):
-    straight, first, second = make(), make(), make()
+@pytest.mark.parametrize("transformed", [False, True])
+def test_a_state_dict_goes_on_bit_for_bit_also_through_a_file(tmp_path, transformed):
+    straight, first, second = (make(transformed) for _ in range(3))
     torch.manual_seed(5)
     batches = [straight.next() for _ in range(3)]
     torch.manual_seed(5)

@@ -237,6 +237,8 @@ class DifferentiableCollector(BaseCollector):
         size = cast(torch.Size, self.env.batch_size)
         self.carry = None if carry is None else TensorDict(carry, size, device=self.env.device)
         self.policy.load_state_dict(state_dict["policy"])
+        with torch.random.fork_rng([]):  # CatFrames has no place for its frames before a reset
+            self.env.reset()
         self.env.load_state_dict(state_dict["env"])
         if state_dict["random"]:
             cast(Any, base_env(self.env)).set_random_state(state_dict["random"])

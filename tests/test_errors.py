@@ -229,6 +229,20 @@ def test_an_action_is_not_looked_at_where_nobody_can(env64, transform):
         assert getattr(torch.func, transform)(reward)(action).isfinite().all()
 
 
+@pytest.mark.parametrize("transform", ["grad", "jacrev", "jacfwd"])
+def test_a_drone_is_not_looked_at_where_nobody_can(env64, transform):
+    td, drone, random = env64.rollout(2)["next"][:, -1].select("state"), env64.params, env64.random_state()
+
+    def reward(mass):
+        env64.set_random_state(random)
+        env64.params = drone.replace(mass=mass)
+        return env64.step(td.copy().set("action", env64.hover_action.repeat(4, 1)))["next", "reward"].sum()
+
+    slope = getattr(torch.func, transform)(reward)(drone.mass)
+    mass = drone.mass.clone().requires_grad_()
+    torch.testing.assert_close(slope, *torch.autograd.grad(reward(mass), mass))
+
+
 @pytest.mark.parametrize("horizon", [0, 2.5, "long"])
 def test_a_horizon_is_a_number_of_steps(env, horizon):
     with pytest.raises(ValueError, match="horizon must be (at least 1|a whole number), got"):

@@ -15,7 +15,7 @@ from torchrl_quad.dynamics.control import FlightController, Nominal, RotorThrust
 from torchrl_quad.dynamics.gains import PhysicsStep, check_flown, check_gains
 from torchrl_quad.dynamics.parameters import PLANT_FIELDS, QuadrotorParams, RawParams
 from torchrl_quad.dynamics.rigid_body import INTEGRATORS, Integrator, RigidBodyState, Rotors, accelerations, drag
-from torchrl_quad.dynamics.vector import Components, Vector, along_z, cat, clamp, stack
+from torchrl_quad.dynamics.vector import Components, Vector, along_z, cat, clamp, is_traced, stack
 from torchrl_quad.errors import DroneWarning, UserValueError
 from torchrl_quad.options import between, checked
 
@@ -183,7 +183,7 @@ class Quadrotor(ControlledModel):
 
     def check_flown(self, params: QuadrotorParams) -> None:
         """Refuse a drone with which the rate loop is unstable."""
-        if not isinstance(self.controller, RotorThrustController):
+        if not (is_traced() or isinstance(self.controller, RotorThrustController)):
             check_flown(self.controller, params, self.dt)
 
     def rest(self, position: Tensor) -> dict[str, Tensor]:

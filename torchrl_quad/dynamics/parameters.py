@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchrl_quad.airframe import JUDGED, contradictions
 from torchrl_quad.dynamics import presets
+from torchrl_quad.dynamics.vector import is_traced
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.options import between, build, checked
 
@@ -96,8 +97,9 @@ class QuadrotorParams:
         fields = self.fields()
         for name, value in fields.items():
             object.__setattr__(self, name, _checked(name, value, like, fields["rotor_positions"]))
-        for broken in contradictions({name: getattr(self, name).detach().cpu().numpy() for name in JUDGED}):
-            raise UserValueError(f"QuadrotorParams: {broken}.")
+        if not is_traced():
+            for broken in contradictions({name: getattr(self, name).detach().cpu().numpy() for name in JUDGED}):
+                raise UserValueError(f"QuadrotorParams: {broken}.")
 
     def __repr__(self) -> str:
         """A table with units."""

@@ -106,7 +106,7 @@ class Randomness:
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Resume from what :meth:`state` returned."""
-        self.generator.set_state(state["generator"].cpu())
+        self.generator.set_state(x if (x := state["generator"]).is_cpu else x.cpu())  # torch.func wraps any copy
         state = copy.deepcopy(state)
         self._position, self._used = state["position"], state["used"]
         self._used = None if self._used is None else self._used.to(self.device)

@@ -5,7 +5,7 @@ import torch
 from refusals import cases, refuses
 from small_runs import assert_equal
 from tensordict.nn import TensorDictModule
-from torchrl.envs import PendulumEnv, StepCounter, TransformedEnv
+from torchrl.envs import BatchSizeTransform, PendulumEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 
 from torchrl_quad import HoveringEnv, TrackingEnv, VisitedStateBuffer, differentiable_rollout, make_actor, restart
@@ -262,3 +262,11 @@ def test_a_restart_begins_a_fraction_of_the_flights_afresh_and_lets_the_others_g
     with pytest.raises(ValueError, match="restart needs the whole state, .*, and the carry lacks .*'action_queue'."):
         restart(env, carry.exclude("state"), 0.5)
     refuses(r"The carry has batch size \(10,\), and the environment \(1000,\)", restart, env, carry[:10], 0.5)
+
+
+def test_flights_without_a_batch_of_their_own_restart_as_the_error_advises():
+    alone, batch = PendulumEnv(seed=0), TransformedEnv(PendulumEnv(seed=0), BatchSizeTransform(batch_size=[8]))
+    _, carry = differentiable_rollout(batch, TORQUE, None, 3)
+    refuses(r"\(8,\), and the environment \(\)\. .* TorchRL's BatchSizeTransform", restart, alone, carry, 0.5)
+    torch.testing.assert_close(restart(batch, carry, 0.0)["th"], carry["th"])
+    assert (restart(batch, carry, 1.0)["th"] != carry["th"]).all()

@@ -237,7 +237,7 @@ def restart(env: EnvBase, carry: TensorDictBase, fraction: Fraction) -> TensorDi
     if carry.shape != size:
         raise UserValueError(
             f"The carry has batch size {tuple(carry.shape)}, and the environment {tuple(size)}. Build one of "
-            "that batch size, such as num_envs=..., to restart flights of it."
+            "that batch size, with num_envs=... or TorchRL's BatchSizeTransform, to restart flights of it."
         )
     fresh = _fresh(env, keys)
     chosen = torch.rand(carry.shape, device=carry.device) < fraction

@@ -85,8 +85,9 @@ def test_the_benchmark_of_a_gpu_runs_on_the_cpu_writes_each_row_and_names_what_f
 
     def without_processes(module):
         save, ended = module.save, SimpleNamespace(returncode=1, stderr="Error: it failed.")
-        save_and_count = lambda path, rows, **about: [saved.append(len(rows)), save(path, rows, **about)]  # noqa: E731
-        monkeypatch.setattr(module, "save", save_and_count)
+        monkeypatch.setattr(
+            module, "save", lambda path, rows, **about: [saved.append(len(rows)), save(path, rows, **about)]
+        )
         monkeypatch.setattr(module, "in_own_process", lambda check: check())
         monkeypatch.setattr(module, "solve", lambda *arguments: None)
         own = SimpleNamespace(run=lambda command, **options: [commands.append(command), ended][1])

@@ -372,8 +372,9 @@ def test_with_respect_to_every_parameter_of_the_drone_also_through_resets(limit,
         with torch.no_grad():
             slope = (fly(**{name: value + step}) - fly(**{name: value - step})) / 2.0
         assert slope != 0.0, name
-        say = lambda said, name=name: f"{name}: {said}"  # noqa: E731
-        torch.testing.assert_close((grad * step).sum(), slope, rtol=1e-5, atol=0.0, msg=say)
+        torch.testing.assert_close(
+            (grad * step).sum(), slope, rtol=1e-5, atol=0.0, msg=lambda said, name=name: f"{name}: {said}"
+        )
 
 
 def test_through_a_partial_reset_the_gradient_is_cut_exactly_there():

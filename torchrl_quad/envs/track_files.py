@@ -252,8 +252,8 @@ def flown_track(path: Path) -> dict[str, Any]:
 
 def check_order(source: str, rotations: Any) -> None:
     """Refuse rotations (k, 4) of gates that all stand upright as x, y, z, w, and lie or lean as w, x, y, z."""
-    a, b, c, d = np.square(rotations).T  # up.z is 1 of a gate that stands upright
-    if (c + d - a - b > 0.999).all() and (abs(a + d - b - c) < 0.9).any():  # -1: an opening upside down
+    read, other = (rotate(q, [0.0, 0.0, 1.0])[:, 2] for q in (rotations, np.roll(rotations, 1, 1)))  # 1: upright
+    if (other > 0.999).all() and (abs(read) < 0.9).any():  # -1: an opening upside down
         raise UserValueError(
             f"{source}: its gates lie or lean if rotations are w, x, y, z, and all stand upright if they are x, y, z, "
             "w. Write w first."

@@ -326,7 +326,7 @@ class Run:
         """Say why a run that has solved nothing may never learn: the traps of the reward, and the time limit."""
         seconds = self.task.max_episode_steps * self.task.control_dt
         limit = f"all episodes end after {seconds:.3g} s: if drones still come nearer then, set max_episode_steps"
-        for trap in [*self._traps(), limit] if crash < 0.05 else self._traps():
+        for trap in [*self._traps(), *([limit] if crash < 0.05 else [])]:
             torchrl_logger.warning(f"Nothing is solved after {self.steps:,} steps. Perhaps {trap}.")
 
     def _traps(self) -> Sequence[str]:

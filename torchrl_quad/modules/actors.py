@@ -44,6 +44,7 @@ def make_actor(
     action_init: Tensor | None = None,
     scale_init: ScaleInit = 0.1,
     learn_scale: bool = True,
+    scale_lb: ScaleInit | None = None,
     noise_correlation: Below1 = 0.0,
     return_log_prob: bool = False,
     recurrent: bool = False,
@@ -66,9 +67,11 @@ def make_actor(
         action_init: the mean action at the start, (k), strictly between the bounds. By default ``env.neutral_action``
             (see :mod:`torchrl_quad.data`; a drone's is to hover), or the middle of the range.
         scale_init: the standard deviation of the policy's noise at the start, before the tanh, in units of half the
-            range. Training brings it down to 0.01 at least, or to a tenth of this.
+            range.
         learn_scale: whether this noise changes with the state and in training. Otherwise neither a gradient through the
             simulator nor a KL bound takes the exploration away.
+        scale_lb: the least that training can bring it down to; None for 0.01, or a tenth of ``scale_init`` if that is
+            less.
         noise_correlation: of the policy's noise in two consecutive steps; 0 is white noise, which averages out; try 0.9
             at 50 Hz. Then loc, scale and the log-probability are those of the action given ``noise_before``, that of
             the step before; ``noise`` is that of the step.
@@ -81,7 +84,7 @@ def make_actor(
         ValueError: the action has no bounds, or more than one dimension; an entry is unknown, or has more than one; or
             the first action is not strictly inside the bounds.
     """
-    head = action_init, scale_init, learn_scale, noise_correlation, return_log_prob
+    head = action_init, scale_init, scale_lb, learn_scale, noise_correlation, return_log_prob
     if recurrent:
         if not num_cells:
             raise UserValueError("A memory reads the first hidden layer: give num_cells at least one, such as [64].")
@@ -107,6 +110,7 @@ def make_visual_actor(
     action_init: Tensor | None = None,
     scale_init: ScaleInit = 0.1,
     learn_scale: bool = True,
+    scale_lb: ScaleInit | None = None,
     noise_correlation: Below1 = 0.0,
     return_log_prob: bool = False,
 ) -> ProbabilisticActor:
@@ -135,7 +139,7 @@ def make_visual_actor(
         hidden_size: numbers in that memory.
         activation: of convolutions and hidden layers.
         input_scale: the vectors are multiplied by this; a number, or one for each of ``in_keys``.
-        action_init, scale_init, learn_scale, noise_correlation, return_log_prob: as for ``make_actor``.
+        action_init, scale_init, learn_scale, scale_lb, noise_correlation, return_log_prob: as for ``make_actor``.
 
     Raises:
         ValueError: the environment has no such image; or as for :func:`~torchrl_quad.make_actor`.
@@ -163,7 +167,7 @@ def make_visual_actor(
     trunk = network_of(env, in_keys, num_cells[0], [], activation, input_scale, more=seen)
     features, keys = Features(convolutions, trunk, activation()), [image_key, *in_keys]
     more = {"num_cells": list(num_cells[1:]), "activation_class": activation}
-    head = action_init, scale_init, learn_scale, noise_correlation, return_log_prob
+    head = action_init, scale_init, scale_lb, learn_scale, noise_correlation, return_log_prob
     return _composed(env, "make_visual_actor", features, keys, hidden_size if recurrent else 0, more, *head)
 
 
@@ -193,6 +197,7 @@ def _policy(
     make_last: Callable[[int], Network],
     action_init: Tensor | None,
     scale_init: float,
+    scale_lb: float | None,
     learn_scale: bool,
     rho: float,
     return_log_prob: bool,
@@ -208,7 +213,9 @@ def _policy(
         layer.weight.mul_(0.01)
         layer.bias.zero_()
         layer.bias[: len(first)] = first
-    least = min(0.01, 0.1 * scale_init)  # to which training can bring the scale down
+    least = min(0.01, 0.1 * scale_init) if scale_lb is None else scale_lb
+    if not least < scale_init:
+        raise UserValueError(f"scale_lb={least} must be less than scale_init={scale_init}, where training starts.")
     max_loc = 5.0 if return_log_prob else math.inf  # as far as TorchRL's TanhNormal goes with tanh_loc=True
     network.head = GaussianHead(len(first), f"biased_softplus_{scale_init}_{least}", max_loc, rho)
     read = [*in_keys, "noise_before"] if rho else list(in_keys)

@@ -53,7 +53,9 @@ def make_value(
     LayerNorm normalises its hidden layers: without it the gradient of the critic, which the policy follows, is far off.
     A critic may read more than the actor does, such as ``in_keys=("observation", ("state", "rotor_speed"))``. Rotors
     turn at some 1000 rad/s, and ``input_scale=(1.0, 1e-3)`` brings both entries to about one. Among obstacles,
-    ``"obstacle"`` (*, 4) is the distance to the nearest [m], and the direction away from it in the body frame.
+    ``"obstacle"`` (*, 4) is the distance to the nearest [m], and the direction away from it in the body frame. Terms of
+    the reward, such as ``("reward_terms", "position")``, show it how near the best state is; they are compressed to
+    sign(x) log(1 + |x|), as in Hafner et al. 2023, arXiv:2301.04104, since some are paid once, and large.
 
     Args:
         env, activation, input_scale, in_keys: as for :func:`~torchrl_quad.make_actor`, and so are the errors.
@@ -186,7 +188,8 @@ def network_of(
         device=env.device,
     )
     dtype = next((spec.dtype for spec in specs if spec.dtype.is_floating_point), None)
-    return Network(mlp.to(dtype), scales, widths)
+    terms = [i for i, key in enumerate(in_keys) if layer_norm and key[0] == "reward_terms"]  # read by critics alone
+    return Network(mlp.to(dtype), scales, widths, terms)
 
 
 def _single(env: EnvBase) -> EnvBase:

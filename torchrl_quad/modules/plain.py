@@ -82,11 +82,14 @@ def log_density(x: Tensor, loc: Tensor, scale: Tensor, bounds: tuple[Tensor, Ten
 
 
 class Network(nn.Module):
-    """A multi-layer perceptron on the concatenation of its inputs of ``widths``, each times one of ``scales``."""
+    """A multi-layer perceptron on the concatenation of its inputs of ``widths``, each times one of ``scales``.
 
-    def __init__(self, mlp: MLP, scales: Sequence[float], widths: Sequence[int]) -> None:
+    Those whose places ``compressed`` has then become sign(x) log(1 + |x|).
+    """
+
+    def __init__(self, mlp: MLP, scales: Sequence[float], widths: Sequence[int], compressed: Sequence[int] = ()):
         super().__init__()
-        self.mlp, self.scales, self.widths = mlp, tuple(scales), tuple(widths)
+        self.mlp, self.scales, self.widths, self.compressed = mlp, tuple(scales), tuple(widths), tuple(compressed)
         self.head: nn.Module = nn.Identity()
         self.is_plain = all(isinstance(x, nn.Linear | nn.LayerNorm) or is_pointwise(x) for x in mlp)
 
@@ -103,7 +106,12 @@ class Network(nn.Module):
                 f"This network was built for entries of {', '.join(map(str, self.widths))} numbers, and reads some of "
                 f"{', '.join(map(str, found))}: those of another environment, or of other options. Build one for this."
             )
-        return concatenated(inputs, self.scales)
+        if not self.compressed:
+            return concatenated(inputs, self.scales)
+        parts = list(concatenated(inputs, self.scales).split(list(self.widths), -1))
+        for place in self.compressed:
+            parts[place] = parts[place].sign() * parts[place].abs().log1p()
+        return torch.cat(parts, -1)
 
 
 class PlainTanhGaussian:

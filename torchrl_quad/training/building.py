@@ -97,7 +97,9 @@ def task_of(env: EnvBase) -> QuadrotorEnv:
 def make_policy(cfg: DictConfig, env: EnvBase) -> TensorDictModule:
     """Build the policy of a configuration, which reads the depth images of a camera if there is one."""
     log_prob = "entropy_bonus" in cfg.loss or cfg.loss.get("alpha", 0) != 0  # of PPO, or of an entropy bonus
-    options = network(cfg, "actor") | {x: cfg.actor[x] for x in ("scale_init", "noise_correlation", "learn_scale")}
+    options = network(cfg, "actor") | {
+        x: cfg.actor[x] for x in ("scale_init", "learn_scale", "scale_lb", "noise_correlation")
+    }
     sees = cfg.actor.vision and "depth" in observed(env)
     remembers = sees or bool(privileged(env))
     options |= {"recurrent": remembers if cfg.actor.recurrent is None else cfg.actor.recurrent}
@@ -118,9 +120,18 @@ def network(cfg: DictConfig, name: str, env: EnvBase | None = None) -> dict[str,
         scale = section.input_scale  # one, or one for each entry
         return options | {"in_keys": keys, "input_scale": plain(scale) if OmegaConf.is_list(scale) else scale}
     if env is not None:
-        more = privileged(env) | ({"obstacle": 1.0} if "obstacle" in observed(env) else {})  # of which there are images
+        more = terms(env) if section.get("reward_terms") else {}
+        more |= privileged(env)
+        more |= {"obstacle": 1.0} if "obstacle" in observed(env) else {}  # of which there are images
         options |= {"in_keys": ["observation", *more], "input_scale": [scale, *more.values()]}
     return options
+
+
+def terms(env: EnvBase) -> dict[NestedKey, float]:
+    """The reward's terms of a task, if it writes them, each with one over its weight: the errors behind it."""
+    weights = getattr(base_env(env), "weights", {})
+    found = [key for key in observed(env).keys(True, True) if key[0] == "reward_terms"]
+    return {key: 1.0 / (weights.get(key[1]) or 1.0) for key in found}
 
 
 def privileged(env: EnvBase) -> dict[NestedKey, float]:
@@ -223,6 +234,45 @@ class AdaptiveOptimizer(Optimizer):
                 group["lr"] = max(group["lr"] / 1.5, 1e-6)
             elif moved < self.limit / 2.25:
                 group["lr"] = min(group["lr"] * 1.5, 20.0 * self.first_lr)
+
+
+class AgreeingOptimizer(Optimizer):
+    """Adam whose rate falls while the gradients of successive horizons point against each other.
+
+    The rate of the schedule is multiplied by a factor, with k = ``agreement_lr`` of the section:
+
+        factor <- clip(factor exp(k cos(g, g_before)), 1/30, 1)
+
+    It falls where the policy overshoots, and rises where it keeps going one way, as in hypergradient descent (Baydin et
+    al. 2018, arXiv:1703.04782), with the cosine instead of the product.
+    """
+
+    def __init__(self, cfg: DictConfig, name: str, module: nn.Module) -> None:
+        super().__init__(cfg, name, module)
+        self.agreement_lr = cfg[name].agreement_lr
+        self.param_groups[0]["agreement"] = 1.0  # here the optimiser's state_dict holds it
+
+    @property
+    def agreement(self) -> float:
+        """The factor."""
+        return self.param_groups[0]["agreement"]
+
+    def anneal(self, iteration: float, pace: float = 1.0) -> None:
+        """Set the learning rate of an iteration, as :class:`Optimizer` does, times the factor."""
+        super().anneal(iteration, pace * self.agreement)
+
+    def compare(self) -> None:
+        """Compare the gradient of the last step, the first in a horizon, with that of the horizon before."""
+        known = [(p.grad, self.state[p]) for group in self.param_groups for p in group["params"] if p.grad is not None]
+        now = torch.cat([grad.flatten() for grad, _ in known])
+        if all("before" in state for _, state in known):
+            before = torch.cat([state["before"].flatten() for _, state in known])
+            cosine = nn.functional.cosine_similarity(now, before, 0).item()
+            self.param_groups[0]["agreement"] = min(
+                max(self.agreement * math.exp(self.agreement_lr * cosine), 1 / 30), 1.0
+            )
+        for grad, state in known:
+            state["before"] = grad.clone()
 
 
 class ReturnScale(nn.Module):

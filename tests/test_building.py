@@ -1,5 +1,6 @@
 """The building blocks of a recipe, and horizons with their graph in TorchRL's Trainer and collectors."""
 
+import copy
 import math
 from types import SimpleNamespace
 
@@ -102,6 +103,20 @@ def test_critics_read_what_a_task_or_a_disturbance_keeps_from_policies_which_the
     assert "recurrent_state" not in forgets.in_keys
 
 
+def test_critics_may_read_the_errors_behind_the_reward_however_large_they_are():
+    cfg = compose("train", ["task=landing", "compile=false", "num_envs=2", "critic.reward_terms=true"])
+    env = building.build_env(cfg, 2, 0)
+    critic = make_value(env, **building.network(cfg, "critic", env))
+    names = ["descent", "approach", "success", "crash", "touchdown_time"]
+    assert critic.in_keys == ["observation", *(("reward_terms", name) for name in names)]
+    seen, *terms = env.observation_spec["observation"].rand(), *(torch.full((2, 1), x) for x in (0.1, -0.9, 20, 0, 0))
+    joined = critic.module.joined([seen, *terms])
+    said = torch.tensor([math.log(2.0), -math.log(10.0), math.log(2.0), 0.0, 0.0])  # of terms over their weights
+    torch.testing.assert_close(joined, torch.cat((seen, said.expand(2, 5)), -1))
+    gradient = torch.autograd.grad(critic(env.reset())["state_value"].sum(), list(critic.parameters()))
+    assert all(x.isfinite().all() for x in gradient)
+
+
 @cases(("mass", 1.0), ("position", "large"), ("position", None))
 def test_what_critics_are_to_read_must_be_in_the_state(key, factor):
     class Wrong(HoveringEnv):
@@ -127,6 +142,21 @@ def test_the_inverse_square_root_of_the_iteration_is_the_same_rate_in_runs_of_ev
     for iteration, share in ((3999, 1.0), (4499, 0.5), (4999, 0.0)):  # and of a run that comes to its last fifth
         adam.anneal(iteration, pace=0.25)
         assert adam.param_groups[0]["lr"] == pytest.approx(share * 0.25e-2 * (150 / iteration) ** 0.5, rel=2e-3)
+
+
+def test_a_rate_falls_while_gradients_turn_back_and_rises_while_they_agree():
+    adam, other = (optimizer(100, building.AgreeingOptimizer, agreement_lr=0.1) for _ in range(2))
+    falls, rises = [0.9048, 0.8187, 0.7408], [0.8187, 0.9048, 1.0, 1.0]
+    for sign, factor in zip([1, -1, 1, -1, -1, -1, -1, -1], [1.0, *falls, *rises], strict=True):
+        adam.param_groups[0]["params"][0].grad = torch.full((1, 1), float(sign))
+        adam.step()
+        adam.compare()
+        adam.anneal(0)
+        assert adam.agreement == pytest.approx(factor, rel=1e-4)
+        assert adam.param_groups[0]["lr"] == pytest.approx(1e-2 * factor, rel=1e-4)
+        if factor == 0.8187:
+            other.load_state_dict(copy.deepcopy(adam.state_dict()))  # as a run does that continues
+    assert other.agreement == pytest.approx(0.8187, rel=1e-4) and next(iter(other.state.values()))["before"] == -1
 
 
 @pytest.mark.parametrize("unit", [1.0, 1000.0])

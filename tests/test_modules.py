@@ -34,6 +34,16 @@ def test_a_policy_starts_close_to_hovering_with_a_little_noise(wrap):
     assert noise.std(0).tolist() == pytest.approx([0.09, 0.1, 0.1, 0.1], abs=0.02)
 
 
+@cases((0.1, None, 0.01), (0.03, None, 0.003), (0.2, 0.05, 0.05))
+def test_training_can_bring_the_noise_down_to_a_bound(scale_init, scale_lb, least):
+    env = HoveringEnv(num_envs=2)
+    actor = make_actor(env, scale_init=scale_init, scale_lb=scale_lb)
+    assert actor(env.reset())["scale"][0].tolist() == pytest.approx(4 * [scale_init], rel=0.05)
+    with torch.no_grad():
+        list(actor.parameters())[-1][4:] = -100.0
+    assert actor(env.reset())["scale"][0].tolist() == pytest.approx(4 * [least], rel=1e-4)
+
+
 def test_the_first_action_can_be_chosen_and_is_the_middle_of_the_range_or_the_mean_of_hovering_elsewhere():
     env = HoveringEnv(num_envs=2, dtype=torch.float64)
     wanted = torch.tensor([0.5, -0.5, 0.0, 0.9], dtype=torch.float64)
@@ -133,6 +143,7 @@ def test_a_network_of_wrong_sizes_or_entries_is_refused(kwargs, message, env, ma
     ({"action_init": ["a", 0.0, 0.0, 0.0]}, r"strictly between .* got \['a', 0.0, 0.0, 0.0\]"),
     ({"scale_init": 1e300}, "scale_init must be at most 100, got 1e.300"),
     ({"scale_init": 0.0}, "scale_init must be at least 0.0001, got 0.0. The standard deviation of the policy"),
+    ({"scale_lb": 0.1}, "scale_lb=0.1 must be less than scale_init=0.1, where training starts"),
     ({"noise_correlation": -0.1}, "noise_correlation must be at least 0, got -0.1"),
     ({"noise_correlation": 1.0}, "noise_correlation must be less than 1, got 1.0"),
 )

@@ -133,6 +133,8 @@ def test_every_network_has_the_precision_of_the_environment_and_may_read_whole_n
 )
 def test_a_network_of_wrong_sizes_or_entries_is_refused(kwargs, message, env, make):
     refuses(message, make, env, **kwargs)
+    if make is not make_actor:
+        refuses("compressed must be some of in_keys, observation.*; got 'crash'", make, env, compressed=["crash"])
 
 
 @cases(

@@ -84,7 +84,7 @@ def log_density(x: Tensor, loc: Tensor, scale: Tensor, bounds: tuple[Tensor, Ten
 class Network(nn.Module):
     """A multi-layer perceptron on the concatenation of its inputs of ``widths``, each times one of ``scales``.
 
-    Those whose places ``compressed`` has then become sign(x) log(1 + |x|).
+    Those at the places in ``compressed`` then become sign(x) log(1 + |x|).
     """
 
     def __init__(self, mlp: MLP, scales: Sequence[float], widths: Sequence[int], compressed: Sequence[int] = ()):

@@ -120,8 +120,9 @@ def network(cfg: DictConfig, name: str, env: EnvBase | None = None) -> dict[str,
         scale = section.input_scale  # one, or one for each entry
         return options | {"in_keys": keys, "input_scale": plain(scale) if OmegaConf.is_list(scale) else scale}
     if env is not None:
-        more = terms(env) if section.get("reward_terms") else {}
-        more |= privileged(env)
+        errors = terms(env) if section.get("reward_terms") else {}
+        options |= {"compressed": list(errors)} if errors else {}
+        more = errors | privileged(env)
         more |= {"obstacle": 1.0} if "obstacle" in observed(env) else {}  # of which there are images
         options |= {"in_keys": ["observation", *more], "input_scale": [scale, *more.values()]}
     return options

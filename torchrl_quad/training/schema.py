@@ -184,6 +184,8 @@ IDLE: list[tuple[str, Callable[[Any], bool], str]] = [
     ("actor.schedule actor.final_lr", lambda c: _kind(c) == "hybrid", "actor.max_kl sets the rate"),
     ("actor.input_scale", lambda c: c["normalize"], "normalize=true"),
     ("critic.input_scale", lambda c: c["normalize"] and not c["critic"].get("in_keys"), "normalize=true"),
+    ("critic.reward_terms", lambda c: c["critic"].get("in_keys"), "critic.in_keys lists all that it reads"),
+    ("actor.scale_lb", lambda c: not c["actor"]["learn_scale"], "actor.learn_scale=false"),
     ("actor.channels", lambda c: c["env"].get("camera") is None, "env.camera=null"),
     ("actor.vision", lambda c: c["env"].get("camera") is None and c["actor"]["vision"], "env.camera=null"),
     ("actor.channels", lambda c: not c["actor"]["vision"], "actor.vision=false"),

@@ -210,6 +210,8 @@ def test_the_programs_of_a_page_run_one_after_the_other(page, tmp_path, monkeypa
     program.write_text(reduced("\n".join(lines)))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("WANDB_MODE", "offline")
+    # A graph runs as it was captured: test_horizon.py compares the code that the compiler makes of one.
+    monkeypatch.setattr("torch._inductor.compile_fx.compile_fx", lambda graph, *_, **__: graph.forward)
     if "examples/data" in program.read_text():
         (tmp_path / "examples").symlink_to(ROOT / "examples")
     if "metrics.csv" in program.read_text():  # it reads what runs have left

@@ -17,7 +17,7 @@ from torchrl.modules import MLP, ValueOperator
 from torchrl_quad.data.unwrap import base_env, check_env, observed
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.modules.plain import Network, layout
-from torchrl_quad.options import AfterValidator, Entries, Field, Scale, Width, checked
+from torchrl_quad.options import AfterValidator, Entries, Entry, Field, Scale, Width, checked
 
 OBSERVATION = ("observation",)
 MOST_WEIGHTS = 100_000_000  # of a network
@@ -47,7 +47,7 @@ def make_value(
     in_keys: Entries = OBSERVATION,
     activation: Activation = nn.ELU,
     input_scale: Scale | Sequence[Scale] = 1.0,
-    compressed: Sequence[NestedKey] = (),
+    compressed: Sequence[Entry] = (),
 ) -> ValueOperator:
     """A state value V(s), written to ``state_value``, (*, 1).
 
@@ -75,7 +75,7 @@ def make_qvalue(
     in_keys: Entries = OBSERVATION,
     activation: Activation = nn.ELU,
     input_scale: Scale | Sequence[Scale] = 1.0,
-    compressed: Sequence[NestedKey] = (),
+    compressed: Sequence[Entry] = (),
     action_scale: Scale = 0.3,
 ) -> ValueOperator:
     """A state-action value Q(s, a), written to ``state_action_value``, (*, 1); otherwise as :func:`make_value`.

@@ -82,10 +82,7 @@ def log_density(x: Tensor, loc: Tensor, scale: Tensor, bounds: tuple[Tensor, Ten
 
 
 class Network(nn.Module):
-    """A multi-layer perceptron on the concatenation of its inputs of ``widths``, each times one of ``scales``.
-
-    Those at the places in ``compressed`` then become sign(x) log(1 + |x|).
-    """
+    """A multi-layer perceptron on its inputs of ``widths``, joined by :func:`concatenated`."""
 
     def __init__(self, mlp: MLP, scales: Sequence[float], widths: Sequence[int], compressed: Sequence[int] = ()):
         super().__init__()
@@ -106,12 +103,7 @@ class Network(nn.Module):
                 f"This network was built for entries of {', '.join(map(str, self.widths))} numbers, and reads some of "
                 f"{', '.join(map(str, found))}: those of another environment, or of other options. Build one for this."
             )
-        if not self.compressed:
-            return concatenated(inputs, self.scales)
-        parts = list(concatenated(inputs, self.scales).split(list(self.widths), -1))
-        for place in self.compressed:
-            parts[place] = parts[place].sign() * parts[place].abs().log1p()
-        return torch.cat(parts, -1)
+        return concatenated(inputs, self.scales, self.compressed)
 
 
 class PlainTanhGaussian:
@@ -363,16 +355,14 @@ def first_noise(x: Tensor, is_random: bool | None) -> Tensor:
     return x.normal_() if is_random else x
 
 
-def concatenated(inputs: Sequence[Tensor], scales: Sequence[float]) -> Tensor:
-    """Vectors (*, k_i), each times its scale, as one."""
-    return torch.cat([x if scale == 1.0 else x * scale for x, scale in zip(inputs, scales, strict=True)], -1)
+def concatenated(inputs: Sequence[Tensor], scales: Sequence[float], compressed: Sequence[int] = ()) -> Tensor:
+    """Vectors (*, k_i), each times its scale, as one; those at the places ``compressed`` as sign(x) log(1 + |x|)."""
+    parts = [x if scale == 1.0 else x * scale for x, scale in zip(inputs, scales, strict=True)]
+    return torch.cat([x.sign() * x.abs().log1p() if i in compressed else x for i, x in enumerate(parts)], -1)
 
 
 def layout(network: nn.Module) -> list[Any]:
-    """The types of a network's parts, their weights and hooks: what differs once somebody has changed a part.
-
-    An activation may be replaced by another one.
-    """
+    """The types of a network's parts, their weights and hooks, which show a change of any part but an activation."""
     found: list[Any] = []
     for part in network.modules():
         hooks = part._forward_hooks or part._forward_pre_hooks or part._backward_hooks or part._backward_pre_hooks

@@ -26,9 +26,10 @@ def main(cfg: DictConfig) -> None:
     actor_optimizer, critic_optimizer = AgreeingOptimizer(cfg, "actor", loss), Optimizer(cfg, "critic", loss)
     scale = ReturnScale(loss)
     run = Run(cfg, env, actor, loss, [actor_optimizer, critic_optimizer, scale])
+    first_gamma = max(2.0 * cfg.gamma - 1.0, 0.0) if cfg.first_gamma is None else cfg.first_gamma
     for _ in run:
         # Until nine tenths of the episodes are solved, or returns level off, the discount looks less far ahead.
-        loss.value_estimator.gamma.fill_(cfg.gamma if run.looks_ahead else cfg.first_gamma)
+        loss.value_estimator.gamma.fill_(cfg.gamma if run.looks_ahead else first_gamma)
         run.horizon, rate, agreement = loss.horizon, actor_optimizer.param_groups[0]["lr"], actor_optimizer.agreement
         # The actor: towards actions that raise the return of one horizon and the value of its end.
         rollout, end = differentiable_rollout(env, actor, run.carry, run.horizon)

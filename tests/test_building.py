@@ -157,6 +157,8 @@ def test_a_rate_falls_while_gradients_turn_back_and_rises_while_they_agree():
         if factor == 0.8187:
             other.load_state_dict(copy.deepcopy(adam.state_dict()))  # as a run does that continues
     assert other.agreement == pytest.approx(0.8187, rel=1e-4) and next(iter(other.state.values()))["before"] == -1
+    other.load_state_dict(optimizer(100).state_dict())  # of a run that knew no agreement
+    assert other.agreement == 1.0
 
 
 @pytest.mark.parametrize("unit", [1.0, 1000.0])

@@ -251,12 +251,11 @@ class AgreeingOptimizer(Optimizer):
     def __init__(self, cfg: DictConfig, name: str, module: nn.Module) -> None:
         super().__init__(cfg, name, module)
         self.agreement_lr = cfg[name].agreement_lr
-        self.param_groups[0]["agreement"] = 1.0  # here the optimiser's state_dict holds it
 
     @property
     def agreement(self) -> float:
-        """The factor."""
-        return self.param_groups[0]["agreement"]
+        """The factor, which the optimiser's state_dict holds once gradients have been compared."""
+        return self.param_groups[0].get("agreement", 1.0)
 
     def anneal(self, iteration: float, pace: float = 1.0) -> None:
         """Set the learning rate of an iteration, as :class:`Optimizer` does, times the factor."""
@@ -264,6 +263,8 @@ class AgreeingOptimizer(Optimizer):
 
     def compare(self) -> None:
         """Compare the gradient of the last step, the first in a horizon, with that of the horizon before."""
+        if self.agreement_lr == 0.0:
+            return
         known = [(p.grad, self.state[p]) for group in self.param_groups for p in group["params"] if p.grad is not None]
         now = torch.cat([grad.flatten() for grad, _ in known])
         if all("before" in state for _, state in known):

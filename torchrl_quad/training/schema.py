@@ -84,7 +84,7 @@ SETTINGS: dict[str, tuple[Any, str]] = {
     "diagnostics": (Count, "Evaluations between audits of reward and gradient; 0 for none."),
     "max_skipped": (Count, "Updates that may be left out for not being finite; 0 stops at the first."),
     "restart_fraction": (Fraction, "The share of flights that each iteration gives up."),
-    "first_gamma": (Fraction, "The discount until nine tenths of the episodes are solved, or returns level off."),
+    "first_gamma": (Fraction | None, "The discount until nine tenths of the episodes are solved; null: 2 gamma - 1."),
     "step": (Positive, "The median change of an action that an iteration asks for, in units of the action."),
     "epochs": (Annotated[int, Field(ge=1, le=10_000)], "Passes over each rollout."),
     "batch_size": (Size, "Control steps in a minibatch."),

@@ -1,4 +1,5 @@
 import gc
+import importlib.util
 import os
 import runpy
 import sys
@@ -19,6 +20,8 @@ from torchrl_quad.envs.markers import Markers, Shape  # noqa: E402
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the programs that tests start, which go side by side
 RECIPES = Path(__file__).parent.parent / "recipes"
+if importlib.util.find_spec("pandas") is None:
+    sys.modules["pandas"] = None  # which tensordict looks for in each call of a module, on the disk
 
 LONG = {"test_docs.py", "test_transforms.py", "test_horizon.py", "test_processes.py", "test_replay.py"}
 
@@ -97,6 +100,8 @@ def launch(monkeypatch, capsys):
     # Hydra composes a configuration once more to find its mode, which none of ours sets, and reads YAML in Python.
     monkeypatch.setattr("hydra._internal.hydra.Hydra.get_mode", lambda *args, **kwargs: None)
     monkeypatch.setattr("yaml.SafeLoader", yaml.CSafeLoader)
+    # It copies its whole store each time, and again each entry that it reads.
+    monkeypatch.setattr("hydra.core.config_store.ConfigStore.__deepcopy__", lambda store, _: store, raising=False)
 
     def launch(name, *arguments):
         monkeypatch.setattr(sys, "argv", [f"recipes/{name}.py", *map(str, arguments)])

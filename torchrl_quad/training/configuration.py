@@ -23,6 +23,7 @@ from torchrl_quad.errors import UserValueError
 CONFIG = Path(__file__).parent / "config"  # in the repository a link to recipes/config
 SET_BY_RECIPES = ("num_envs", "device", "seed", "compile")  # settings outside ``env``
 OWN: dict[str, tuple[str, Mapping[str, Any]]] = {}  # recipes of your own: the configuration each is made from, and more
+_OFFERED: dict[tuple[str, str], type | None] = {}  # what is in hydra's store, by group and name, with a task's class
 # hydra's own options that take a value are these, and some with a hyphen in their name.
 _SETTING = re.compile(r"--(?!cfg=|package=|info=)([\w.@/]+=.*)", re.DOTALL)
 # What Python and hydra write differently: a string, which may be a key with its colon, and None.
@@ -44,11 +45,20 @@ def command_line(arguments: Iterable[str]) -> list[str]:
     for name in {*TASKS, *re.findall(r"[\w.]+", asked)}:
         # Other names are words of a sweep, such as choice(hovering, racing).
         if name in asked.split(",") or name in available_tasks() or "." in name:
-            node = {"task": name, "env": defaults(task_class(name))}
-            ConfigStore.instance().store(group="task", name=name, node=node, package="_global_")
-    for name, node in tuned().items():
-        ConfigStore.instance().store(group="tuned", name=name, node=node, package="_global_")
+            _offer("task", name, task_class(name))
+    for name in tuned():
+        _offer("tuned", name)
     return arguments
+
+
+def _offer(group: str, name: str, cls: type[QuadrotorEnv] | None = None) -> None:
+    """Put a task, or what is tuned for one, into hydra's store, unless it is there."""
+    store = ConfigStore.instance()
+    if f"{name}.yaml" in store.repo.get(group, {}) and _OFFERED.get((group, name)) is cls:
+        return
+    _OFFERED[group, name] = cls
+    node = tuned()[name] if cls is None else {"task": name, "env": defaults(cls)}
+    store.store(group=group, name=name, node=node, package="_global_")
 
 
 @functools.cache

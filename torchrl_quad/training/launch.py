@@ -82,7 +82,8 @@ def recipe(config: str, **settings: Any) -> Callable[[Callable[[DictConfig], Non
                 OWN[name] = config, settings
             try:
                 with _explained(), contextlib.ExitStack() as stack:
-                    _check(cfg, HydraConfig.get())
+                    if HydraConfig.get().mode == RunMode.MULTIRUN or "check" not in HydraConfig.get().callbacks:
+                        _check(cfg, HydraConfig.get())  # others have been checked before their folder was made
                     if "algorithm" in cfg:
                         stack.enter_context(_joined(cfg))
                         folder = stack.enter_context(_run_folder(cfg.resume))

@@ -6,7 +6,9 @@ a recipe say which of them it has.
 
 from __future__ import annotations
 
+import copy
 import difflib
+import functools
 import inspect
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -239,6 +241,16 @@ def settings(name: str) -> dict[str, Any]:
     config, own = OWN.get(name, (name, {}))
     if config not in {*LOSSES, *PROGRAMS.values()}:
         return plain(OmegaConf.merge(*map(settings, LOSSES)))
+    return _merged(config, own) if own else copy.deepcopy(_shipped(config))
+
+
+@functools.cache
+def _shipped(config: str) -> dict[str, Any]:
+    """The settings of a recipe that ships, whose files are read once."""
+    return _merged(config, {})
+
+
+def _merged(config: str, own: Mapping[str, Any]) -> dict[str, Any]:
     recipe = OmegaConf.load(CONFIG / f"{config}.yaml")
     shared = [OmegaConf.load(CONFIG / f"{x}.yaml") for x in recipe.defaults if x in ("common", "critic")]
     merged = plain(OmegaConf.merge(*shared, recipe, own)) | ({"task": None} if shared else {})

@@ -1,13 +1,14 @@
 """The runs that put the paper on trial."""
 
 import math
+import multiprocessing
 import os
 import re
 import shlex
 import signal
-import subprocess
 import sys
 import time
+import warnings
 
 import numpy as np
 import pytest
@@ -100,23 +101,20 @@ def test_a_run_that_fails_is_reported_and_the_others_go_on(monkeypatch, capsys, 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_the_runs_and_starts_no_others(number, tmp_path):
     sleeper = "import os, time; print(os.getpid(), flush=True); time.sleep(99)"
-    program = f"""
-import sys
-from pathlib import Path
-from benchmarks.paper.running import command, side_by_side
-folder = Path({str(tmp_path)!r})
-side_by_side(1, [(command, [sys.executable, "-c", {sleeper!r}], folder / str(i)) for i in range(3)])
-"""
-    said, log, deadline = tmp_path / "said.txt", tmp_path / "0/log.txt", time.monotonic() + 120
-    with said.open("w") as file, subprocess.Popen([sys.executable, "-c", program], stderr=file) as process:
-        try:
-            while not log.exists() or not log.read_text():
-                assert process.poll() is None and time.monotonic() < deadline, said.read_text()
-                time.sleep(0.1)
-            process.send_signal(number)
-            assert process.wait(30) == 128 + number
-        finally:
-            process.kill()
+    jobs = [(running.command, [sys.executable, "-c", sleeper], tmp_path / str(i)) for i in range(3)]
+    process = multiprocessing.get_context("fork").Process(target=running.side_by_side, args=(1, jobs))
+    log, deadline = tmp_path / "0/log.txt", time.monotonic() + 120
+    with warnings.catch_warnings(action="ignore", category=DeprecationWarning):  # of threads, which the copy has not
+        process.start()
+    try:
+        while not log.exists() or not log.read_text():
+            assert process.is_alive() and time.monotonic() < deadline
+            time.sleep(0.1)
+        os.kill(process.pid, number)
+        process.join(30)
+        assert process.exitcode == 128 + number
+    finally:
+        process.kill()
     with pytest.raises(ProcessLookupError):
         os.kill(int(log.read_text()), 0)
     assert not (tmp_path / "1").exists()

@@ -15,7 +15,7 @@ EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("*.py"))
 BUDGET = re.compile(r"^(STEPS|ITERATIONS) = [\d_]+$", flags=re.MULTILINE)
 LONG = {r"(?<=rollout\()256\b|(?<=actor, None, )256\b": "20", r"\(8, 16, 32, 64\)": "(2, 4)"}
 LONG |= {"max_envs=8": "max_envs=2", r"(?<=actor, carry, )\d\d\b": "8", r"(?<=ForestEnv\(num_envs=)\d+": "2"}
-LONG |= {r"(?<=HoveringEnv\(num_envs=)8(?=, drone=)": "2, max_episode_steps=40"}
+LONG |= {r"(?<=HoveringEnv\(num_envs=)8(?=, drone=)": "2, max_episode_steps=40", r"\bsteps=3\)": "steps=3, horizon=4)"}
 
 
 def reduced(program):

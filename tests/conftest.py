@@ -97,10 +97,10 @@ def launch(monkeypatch, capsys):
     """``python recipes/NAME.py ARGUMENTS``, but in this process, where it starts quicker and parts can be replaced."""
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
     monkeypatch.setenv("WANDB_MODE", "offline")
-    # Hydra composes a configuration once more to find its mode, which none of ours sets, and reads YAML in Python.
+    # Hydra composes a configuration once more to find its mode, which none of ours sets, reads YAML in Python, and
+    # copies its whole store for each run, and then each entry that it reads.
     monkeypatch.setattr("hydra._internal.hydra.Hydra.get_mode", lambda *args, **kwargs: None)
     monkeypatch.setattr("yaml.SafeLoader", yaml.CSafeLoader)
-    # It copies its whole store each time, and again each entry that it reads.
     monkeypatch.setattr("hydra.core.config_store.ConfigStore.__deepcopy__", lambda store, _: store, raising=False)
 
     def launch(name, *arguments):

@@ -29,9 +29,8 @@ def join(rank, port):
 @pytest.fixture(scope="module")
 def in_two_processes():
     """What a function of the rank returns in each of two processes."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["torchrl_quad.training.loop", "hydra.main"])  # imported once for both
-    with ProcessPoolExecutor(2, context) as pool:
+    multiprocessing.set_forkserver_preload(["torchrl_quad.training.loop", "hydra.main"])  # imported once for both
+    with ProcessPoolExecutor(2, multiprocessing.get_context("forkserver")) as pool:
         yield lambda function, *arguments: list(pool.map(function, (0, 1), *([x] * 2 for x in arguments), timeout=300))
 
 

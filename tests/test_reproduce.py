@@ -8,7 +8,6 @@ import shlex
 import signal
 import sys
 import time
-import warnings
 
 import numpy as np
 import pytest
@@ -98,23 +97,20 @@ def test_a_run_that_fails_is_reported_and_the_others_go_on(monkeypatch, capsys, 
     assert (rows[0]["solved"], rows[0]["seconds"], rows[0]["flown"].count("-")) == ("0.1", "1.5", 2)
 
 
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # has threads, which its copy does not need
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_the_runs_and_starts_no_others(number, tmp_path):
     sleeper = "import os, time; print(os.getpid(), flush=True); time.sleep(99)"
     jobs = [(running.command, [sys.executable, "-c", sleeper], tmp_path / str(i)) for i in range(3)]
-    process = multiprocessing.get_context("fork").Process(target=running.side_by_side, args=(1, jobs))
+    process = multiprocessing.get_context("fork").Process(target=running.side_by_side, args=(1, jobs), daemon=True)
     log, deadline = tmp_path / "0/log.txt", time.monotonic() + 120
-    with warnings.catch_warnings(action="ignore", category=DeprecationWarning):  # of threads, which the copy has not
-        process.start()
-    try:
-        while not log.exists() or not log.read_text():
-            assert process.is_alive() and time.monotonic() < deadline
-            time.sleep(0.1)
-        os.kill(process.pid, number)
-        process.join(30)
-        assert process.exitcode == 128 + number
-    finally:
-        process.kill()
+    process.start()
+    while not log.exists() or not log.read_text():
+        assert process.is_alive() and time.monotonic() < deadline
+        time.sleep(0.1)
+    os.kill(process.pid, number)
+    process.join(30)
+    assert process.exitcode == 128 + number
     with pytest.raises(ProcessLookupError):
         os.kill(int(log.read_text()), 0)
     assert not (tmp_path / "1").exists()

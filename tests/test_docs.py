@@ -54,9 +54,9 @@ def test_the_site_builds_without_a_warning_describes_every_public_name_and_fits_
     _, *options, folder = shlex.split(command)
     assert folder == "docs/_build/html"
     assert {"-W", "--keep-going", "-n"} <= set(options)
-    # Without listings of all modules, which are a part of the time.
+    # In one process, and without listings of all modules, which are a part of the time.
     options += ["-D", "extensions=myst_parser,sphinx.ext.autodoc,sphinx.ext.autosummary,sphinx.ext.napoleon,extension"]
-    run(sys.executable, *options, str(tmp_path))
+    run(sys.executable, *options, "-j1", str(tmp_path), timeout=600)
     with open(tmp_path / "objects.inv", "rb") as file:
         inventory = InventoryFile.load(file, "", lambda *parts: "".join(parts))
     described = set().union(*inventory.values())

@@ -6,15 +6,7 @@ python recipes/train.py task=hovering seed=0
 from omegaconf import DictConfig
 
 from torchrl_quad import AHACLoss, differentiable_rollout, make_value, restart
-from torchrl_quad.training.building import (
-    AgreeingOptimizer,
-    Optimizer,
-    ReturnScale,
-    make_loss,
-    mean_of_all,
-    set_up,
-    update_normalizer,
-)
+from torchrl_quad.training.building import Optimizer, ReturnScale, make_loss, mean_of_all, set_up, update_normalizer
 from torchrl_quad.training.launch import recipe
 from torchrl_quad.training.loop import Run
 
@@ -23,36 +15,34 @@ from torchrl_quad.training.loop import Run
 def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
     loss = make_loss(AHACLoss, cfg, env, actor, make_value, horizon=cfg.horizon)
-    actor_optimizer, critic_optimizer = AgreeingOptimizer(cfg, "actor", loss), Optimizer(cfg, "critic", loss)
+    actor_optimizer, critic_optimizer = Optimizer(cfg, "actor", loss), Optimizer(cfg, "critic", loss)
     scale = ReturnScale(loss)
     run = Run(cfg, env, actor, loss, [actor_optimizer, critic_optimizer, scale])
-    first_gamma = max(2.0 * cfg.gamma - 1.0, 0.0) if cfg.first_gamma is None else cfg.first_gamma
     for _ in run:
-        # Until nine tenths of the episodes are solved, or returns level off, the discount looks less far ahead.
-        loss.value_estimator.gamma.fill_(cfg.gamma if run.looks_ahead else first_gamma)
-        run.horizon, rate, agreement = loss.horizon, actor_optimizer.param_groups[0]["lr"], actor_optimizer.agreement
+        # Until nine tenths of the episodes are solved, or returns level off, the discount looks half as far ahead.
+        loss.value_estimator.gamma.fill_(cfg.gamma if run.looks_ahead else max(2.0 * cfg.gamma - 1.0, 0.0))
+        run.horizon = loss.horizon
         # The actor: towards actions that raise the return of one horizon and the value of its end.
         rollout, end = differentiable_rollout(env, actor, run.carry, run.horizon)
         scale.divide(rollout)
         target, metrics = loss.better_actions(rollout, cfg.step)
         data = rollout.detach().set("action_target", target)
-        for epoch in range(cfg.epochs):
+        for _ in range(cfg.epochs):
             loss_actor = loss.loss_fit(data)
             if not run.optimise(actor_optimizer, loss_actor):
                 break
-            if epoch == 0:
-                actor_optimizer.compare()
 
         # The critics: towards TD(lambda) targets, from the least of them; the more steps, the slower the actor learns.
         data = loss.write_value_target(data)
         scale.update(data)
-        share = max(rate / (run.pace * agreement * actor_optimizer.first_lr), 1 / 3)
+        rate = actor_optimizer.param_groups[0]["lr"]
+        share = max(rate / (run.pace * actor_optimizer.first_lr), 1 / 3)
         critic_metrics = run.fit_critic(critic_optimizer, data, times=1 / share)
 
         update_normalizer(env, rollout)
         run.carry = restart(env, end, cfg.restart_fraction)
         loss.adapt_horizon(mean_of_all(metrics["stiffness"]))
-        run.record(horizon=run.horizon, rate=rate, agreement=agreement, scale=scale.value, loss_actor=loss_actor)
+        run.record(horizon=run.horizon, rate=rate, scale=scale.value, loss_actor=loss_actor)
         run.record(**metrics, **critic_metrics)
 
 

@@ -1,6 +1,5 @@
 """The building blocks of a recipe, and horizons with their graph in TorchRL's Trainer and collectors."""
 
-import copy
 import math
 from types import SimpleNamespace
 
@@ -142,23 +141,6 @@ def test_the_inverse_square_root_of_the_iteration_is_the_same_rate_in_runs_of_ev
     for iteration, share in ((3999, 1.0), (4499, 0.5), (4999, 0.0)):  # and of a run that comes to its last fifth
         adam.anneal(iteration, pace=0.25)
         assert adam.param_groups[0]["lr"] == pytest.approx(share * 0.25e-2 * (150 / iteration) ** 0.5, rel=2e-3)
-
-
-def test_a_rate_falls_while_gradients_turn_back_and_rises_while_they_agree():
-    adam, other = (optimizer(100, building.AgreeingOptimizer, agreement_lr=0.1) for _ in range(2))
-    falls, rises = [0.9048, 0.8187, 0.7408], [0.8187, 0.9048, 1.0, 1.0]
-    for sign, factor in zip([1, -1, 1, -1, -1, -1, -1, -1], [1.0, *falls, *rises], strict=True):
-        adam.param_groups[0]["params"][0].grad = torch.full((1, 1), float(sign))
-        adam.step()
-        adam.compare()
-        adam.anneal(0)
-        assert adam.agreement == pytest.approx(factor, rel=1e-4)
-        assert adam.param_groups[0]["lr"] == pytest.approx(1e-2 * factor, rel=1e-4)
-        if factor == 0.8187:
-            other.load_state_dict(copy.deepcopy(adam.state_dict()))  # as a run does that continues
-    assert other.agreement == pytest.approx(0.8187, rel=1e-4) and next(iter(other.state.values()))["before"] == -1
-    other.load_state_dict(optimizer(100).state_dict())  # of a run that knew no agreement
-    assert other.agreement == 1.0
 
 
 @pytest.mark.parametrize("unit", [1.0, 1000.0])

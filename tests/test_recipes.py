@@ -206,12 +206,21 @@ def test_abpt_lands_tracks_and_flies_two_laps(task, tmp_path):
     assert task != "tracking" or found["tracking_rmse"] < 0.05
 
 
-def test_what_an_older_recipe_wrote_can_be_flown_but_not_continued(train, launch, refused, no_pictures, tmp_path):
+@pytest.mark.parametrize(
+    ("pattern", "lines", "had"),
+    [
+        (r"(?m)^(step|epochs):.*\n", "", "no step, no epochs"),
+        ("(?m)^actor:\n", "older: 1\nactor:\n  gone: 0.5\n  off: 0.0\n", "older, actor.gone"),
+    ],
+)
+def test_what_an_older_recipe_wrote_can_be_flown_but_not_continued(
+    pattern, lines, had, train, launch, refused, no_pictures, tmp_path
+):
     train("train", tmp_path)
     path = tmp_path / "checkpoint.pt"
     saved = read_checkpoint(path)
-    saved["config"] = "".join(line for line in saved["config"].splitlines(True) if not re.match("step:|epochs:", line))
+    saved["config"] = re.sub(pattern, lines, saved["config"])
     write_checkpoint(path, saved, None)
     assert "4 fresh episodes" in launch("evaluate", f"checkpoint={path}", "episodes=4")
     said = refused("train", f"resume={path}", "total_steps=960")
-    assert f"{path} was written by an older train.py, which had no step, epochs. Continue it with that version" in said
+    assert f"{path} was written by an older train.py, which had {had}. Continue it with that version" in said

@@ -237,46 +237,6 @@ class AdaptiveOptimizer(Optimizer):
                 group["lr"] = min(group["lr"] * 1.5, 20.0 * self.first_lr)
 
 
-class AgreeingOptimizer(Optimizer):
-    """Adam whose rate falls while the gradients of successive horizons point against each other.
-
-    The rate of the schedule is multiplied by a factor, with k = ``agreement_lr`` of the section:
-
-        factor <- clip(factor exp(k cos(g, g_before)), 1/30, 1)
-
-    It falls where the policy overshoots, and rises where it keeps going one way, as in hypergradient descent (Baydin et
-    al. 2018, arXiv:1703.04782), with the cosine instead of the product.
-    """
-
-    def __init__(self, cfg: DictConfig, name: str, module: nn.Module) -> None:
-        super().__init__(cfg, name, module)
-        self.agreement_lr = cfg[name].agreement_lr
-
-    @property
-    def agreement(self) -> float:
-        """The factor, which the optimiser's state_dict holds once gradients have been compared."""
-        return self.param_groups[0].get("agreement", 1.0)
-
-    def anneal(self, iteration: float, pace: float = 1.0) -> None:
-        """Set the learning rate of an iteration, as :class:`Optimizer` does, times the factor."""
-        super().anneal(iteration, pace * self.agreement)
-
-    def compare(self) -> None:
-        """Compare the gradient of the last step, the first in a horizon, with that of the horizon before."""
-        if self.agreement_lr == 0.0:
-            return
-        known = [(p.grad, self.state[p]) for group in self.param_groups for p in group["params"] if p.grad is not None]
-        now = torch.cat([grad.flatten() for grad, _ in known])
-        if all("before" in state for _, state in known):
-            before = torch.cat([state["before"].flatten() for _, state in known])
-            cosine = nn.functional.cosine_similarity(now, before, 0).item()
-            self.param_groups[0]["agreement"] = min(
-                max(self.agreement * math.exp(self.agreement_lr * cosine), 1 / 30), 1.0
-            )
-        for grad, state in known:
-            state["before"] = grad.clone()
-
-
 class ReturnScale(nn.Module):
     """The root mean square of a run's returns, by which rewards are divided, so that values are about 1 on every task.
 

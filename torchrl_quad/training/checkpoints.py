@@ -112,10 +112,11 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
         if value != was:
             OmegaConf.update(saved, key, value)
     before = presets.parse(content["config"].encode(), str(path))
-    known = settings(str(saved.algorithm)).items()
-    if lacking := [name for name, default in known if default is not None and name not in before]:
+    known = settings(str(saved.algorithm))
+    lacking = [f"no {name}" for name, default in known.items() if default is not None and name not in before]
+    if differs := lacking + [name for name, value in _gone(before, known).items() if value]:
         raise UserValueError(
-            f"{path} was written by an older {saved.algorithm}.py, which had no {', '.join(lacking)}. Continue it with "
+            f"{path} was written by an older {saved.algorithm}.py, which had {', '.join(differs)}. Continue it with "
             "that version, or start a new run without resume; evaluate.py and export.py read it."
         )
     saved.resume = cfg.resume
@@ -155,6 +156,9 @@ def saved_config(path: Path, content: Mapping[str, Any], trust: Collection[str] 
     try:
         known = settings(str(values.get("algorithm")))
         cfg = OmegaConf.create(_with_newer(values, known))
+        for name in _gone(values, known):
+            section, _, key = name.rpartition(".")
+            del (cfg[section] if section else cfg)[key]
         check(cfg)
     except UserError as error:
         raise UserValueError(f"{source}: {error}") from error
@@ -170,6 +174,17 @@ def _with_newer(values: Mapping[str, Any], known: Mapping[str, Any]) -> dict[str
         name: _with_newer(x, sections[name]) if name in sections and isinstance(x, Mapping) else x
         for name, x in values.items()
     }
+
+
+def _gone(values: Mapping[str, Any], known: Mapping[str, Any], section: str = "") -> dict[str, Any]:
+    """The settings of a recipe and its networks that a configuration has and this version has not, by whole names."""
+    found = {}
+    for name, value in values.items():
+        if name not in known:
+            found[f"{section}{name}"] = value
+        elif name in ("actor", "critic", "eval") and isinstance(value, Mapping):
+            found |= _gone(value, known[name], f"{name}.")
+    return found
 
 
 @contextlib.contextmanager

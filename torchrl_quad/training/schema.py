@@ -86,7 +86,6 @@ SETTINGS: dict[str, tuple[Any, str]] = {
     "diagnostics": (Count, "Evaluations between audits of reward and gradient; 0 for none."),
     "max_skipped": (Count, "Updates that may be left out for not being finite; 0 stops at the first."),
     "restart_fraction": (Fraction, "The share of flights that each iteration gives up."),
-    "first_gamma": (Fraction | None, "The discount until nine tenths of the episodes are solved; null: 2 gamma - 1."),
     "step": (Positive, "The median change of an action that an iteration asks for, in units of the action."),
     "epochs": (Annotated[int, Field(ge=1, le=10_000)], "Passes over each rollout."),
     "batch_size": (Size, "Control steps in a minibatch."),
@@ -113,7 +112,6 @@ SETTINGS: dict[str, tuple[Any, str]] = {
     "actor.hidden_size": (Width, "Numbers in that memory."),
     "actor.channels": (_Channels, "Of the convolutions of a visual policy: [8, 16]."),
     "actor.max_kl": (Positive | None, "How far an update, or PPO's iteration, may move the policy; null for none."),
-    "actor.agreement_lr": (NonNegative, "How fast the rate follows the cosine of successive gradients; 0: not at all."),
     "actor.average": (Share | None, "The share of the iterations whose weights are averaged, as 0.1; null for none."),
     "critic.in_keys": (
         Annotated[list[str | list[str]], Field(min_length=1)] | None,

@@ -114,7 +114,7 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
     before = presets.parse(content["config"].encode(), str(path))
     known = settings(str(saved.algorithm))
     lacking = [f"no {name}" for name, default in known.items() if default is not None and name not in before]
-    if differs := lacking + [name for name, value in _gone(before, known).items() if value]:
+    if differs := lacking + [name for name, value in _as_now(before, known)[1].items() if value]:
         raise UserValueError(
             f"{path} was written by an older {saved.algorithm}.py, which had {', '.join(differs)}. Continue it with "
             "that version, or start a new run without resume; evaluate.py and export.py read it."
@@ -155,10 +155,7 @@ def saved_config(path: Path, content: Mapping[str, Any], trust: Collection[str] 
         )
     try:
         known = settings(str(values.get("algorithm")))
-        cfg = OmegaConf.create(_with_newer(values, known))
-        for name in _gone(values, known):
-            section, _, key = name.rpartition(".")
-            del (cfg[section] if section else cfg)[key]
+        cfg = OmegaConf.create(_as_now(values, known)[0])
         check(cfg)
     except UserError as error:
         raise UserValueError(f"{source}: {error}") from error
@@ -167,24 +164,23 @@ def saved_config(path: Path, content: Mapping[str, Any], trust: Collection[str] 
     return cfg
 
 
-def _with_newer(values: Mapping[str, Any], known: Mapping[str, Any]) -> dict[str, Any]:
-    """A configuration with the settings that came after it, as they ship."""
-    sections = {name: section for name, section in known.items() if isinstance(section, Mapping)}
-    return dict(known) | {
-        name: _with_newer(x, sections[name]) if name in sections and isinstance(x, Mapping) else x
-        for name, x in values.items()
-    }
+def _as_now(
+    values: Mapping[str, Any], known: Mapping[str, Any], section: str = ""
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """A configuration with the settings that came after it, as they ship, and apart from it those that are gone.
 
-
-def _gone(values: Mapping[str, Any], known: Mapping[str, Any], section: str = "") -> dict[str, Any]:
-    """The settings of a recipe and its networks that a configuration has and this version has not, by whole names."""
-    found = {}
+    These are settings of the recipe, its networks and evaluations that this version has not, by their whole names.
+    """
+    now, gone = dict(known), {}
     for name, value in values.items():
-        if name not in known:
-            found[f"{section}{name}"] = value
-        elif name in ("actor", "critic", "eval") and isinstance(value, Mapping):
-            found |= _gone(value, known[name], f"{name}.")
-    return found
+        if name not in known and section in ("", "actor.", "critic.", "eval."):
+            gone[f"{section}{name}"] = value
+        elif isinstance(value, Mapping) and isinstance(known.get(name), Mapping):
+            now[name], gone_from_it = _as_now(value, known[name], f"{section}{name}.")
+            gone |= gone_from_it
+        else:
+            now[name] = value
+    return now, gone
 
 
 @contextlib.contextmanager

@@ -19,6 +19,11 @@ def main(cfg: DictConfig) -> None:
     scale = ReturnScale(loss)
     run = Run(cfg, env, actor, loss, [actor_optimizer, critic_optimizer, scale])
     for _ in run:
+        # The more slowly the actor learns, the less noise shakes the drones, and the further it trusts the simulator.
+        rate = actor_optimizer.param_groups[0]["lr"]
+        share = rate / actor_optimizer.first_lr
+        actor.scale_noise(max(share, 0.25))
+        loss.gradient_lmbda = 1.0 - run.pace * (1.0 - cfg.loss.gradient_lmbda)
         # Until nine tenths of the episodes are solved, or returns level off, the discount looks half as far ahead.
         loss.value_estimator.gamma.fill_(cfg.gamma if run.looks_ahead else max(2.0 * cfg.gamma - 1.0, 0.0))
         run.horizon = loss.horizon
@@ -35,9 +40,7 @@ def main(cfg: DictConfig) -> None:
         # The critics: towards TD(lambda) targets, from the least of them; the more steps, the slower the actor learns.
         data = loss.write_value_target(data)
         scale.update(data)
-        rate = actor_optimizer.param_groups[0]["lr"]
-        share = max(rate / (run.pace * actor_optimizer.first_lr), 1 / 3)
-        critic_metrics = run.fit_critic(critic_optimizer, data, times=1 / share)
+        critic_metrics = run.fit_critic(critic_optimizer, data, times=1 / max(share / run.pace, 1 / 3))
 
         update_normalizer(env, rollout)
         run.carry = restart(env, end, cfg.restart_fraction)

@@ -73,8 +73,6 @@ IGNORED = {  # what a person wrote, which nothing would read
     "shac task=racing tuned=shac_racing_positon": "tuned=shac_racing_positon: .* Choose from: shac_racing_position",
     "shac actor.schedule=constant actor.final_lr=0.1": "actor.final_lr=0.1 has no effect: actor.schedule=constant",
     "hybrid actor.schedule=cosine": "actor.schedule=cosine has no effect: actor.max_kl sets the rate",
-    "train critic.reward_terms=true critic.in_keys=[observation]": "critic.reward_terms=true has no effect: critic.in_",
-    "train actor.scale_lb=0.05": "actor.scale_lb=0.05 has no effect: actor.learn_scale=false",
     "abpt normalize=true critic.input_scale=2.0": "critic.input_scale=2.0 has no effect: normalize=true",
     "bptt actor.channels=[4]": r"actor.channels=\[4\] has no effect: env.camera=null",
     "bptt task=forest actor.recurrent=false actor.hidden_size=8": "actor.hidden_size=8 has no effect",

@@ -131,7 +131,7 @@ def test_a_run_ends_when_its_evaluation_has_levelled_off_says_so_and_goes_on_wit
     options = [*SMALL, "horizon=2", "eval.interval=1", "total_steps=480", f"hydra.run.dir={tmp_path}", "resume=auto"]
     said = launch("bptt", *options, "eval.patience=0.5")
     assert "Stopped before total_steps: no evaluation has risen since step 8.\n" in said
-    assert read_checkpoint(tmp_path / "checkpoint.pt")["iteration"] == len(rows(tmp_path)) == 15
+    assert read_checkpoint(tmp_path / "checkpoint.pt")["iteration"] == len(rows(tmp_path)) == 22
     assert launch("bptt", *options) == f"Finished before: {tmp_path}\n"
     assert "Stopped" not in launch("bptt", *options, "eval.patience=null")
     assert len(rows(tmp_path)) == 60
@@ -148,11 +148,12 @@ def test_a_run_that_lost_a_third_of_what_it_solved_goes_back_to_its_best_policy_
     monkeypatch.setattr(loop.Run, "_save", keep)
     scripted = lambda *_: (dict.fromkeys(("eval/return", "eval/solved"), script[len(seen)]), seen.append(0))  # noqa: E731
     monkeypatch.setattr(loop, "evaluate", scripted)
-    paces = [1, 1, 1, 2, 1, 0.25, 2, 0.25]
+    paces = [1, 1, 1, 2, 0.5, 0.25, 2, 0.25]
     monkeypatch.setattr(loop, "next_pace", lambda rows, since, _: paces[len(rows) - 1 if since or len(rows) < 7 else 0])
     options, seen = ["eval.interval=1", "eval.patience=0.9", "actor.average=0.5", "actor.schedule=constant"], []
     straight = train("train", tmp_path / "straight", *options)
-    assert [row["train/rate"] for row in saved[8]["rows"]] + [saved[8]["pace"]] == [*[1e-2] * 6, 2.5e-3, 5e-3, 0.125]
+    assert [row["train/rate"] for row in saved[8]["rows"]] == [*[1e-2] * 5, 5e-3, 1.25e-3, 2.5e-3]
+    assert saved[8]["pace"] == 0.0625
     best, policy = saved[3]["stateful"], saved[3]["best"]["actor"]
     assert not torch.equal(policy[key := "module.0.module.mlp.0.weight"], best[0][f"actor_network_params.{key}"])
     best[0] |= {f"actor_network_params.{name}": x for name, x in policy.items()}  # the mean, which solved so many

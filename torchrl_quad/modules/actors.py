@@ -25,7 +25,6 @@ from torchrl_quad.modules.plain import (
     GaussianHead,
     Network,
     PlainTanhGaussian,
-    first_noise,
     is_pointwise,
     layout,
     tanh_gaussian,
@@ -44,7 +43,6 @@ def make_actor(
     action_init: Tensor | None = None,
     scale_init: ScaleInit = 0.1,
     learn_scale: bool = True,
-    scale_lb: ScaleInit | None = None,
     noise_correlation: Below1 = 0.0,
     return_log_prob: bool = False,
     recurrent: bool = False,
@@ -67,11 +65,9 @@ def make_actor(
         action_init: the mean action at the start, (k), strictly between the bounds. By default ``env.neutral_action``
             (see :mod:`torchrl_quad.data`; a drone's is to hover), or the middle of the range.
         scale_init: the standard deviation of the policy's noise at the start, before the tanh, in units of half the
-            range.
+            range. Training brings it down to 0.01 at least, or to a tenth of this.
         learn_scale: whether this noise changes with the state and in training. Otherwise neither a gradient through the
             simulator nor a KL bound takes the exploration away.
-        scale_lb: the least that training can bring it down to; None for 0.01, or a tenth of ``scale_init`` if that is
-            less.
         noise_correlation: of the policy's noise in two consecutive steps; 0 is white noise, which averages out; try 0.9
             at 50 Hz. Then loc, scale and the log-probability are those of the action given ``noise_before``, that of
             the step before; ``noise`` is that of the step.
@@ -84,7 +80,7 @@ def make_actor(
         ValueError: the action has no bounds, or more than one dimension; an entry is unknown, or has more than one; or
             the first action is not strictly inside the bounds.
     """
-    head = action_init, scale_init, scale_lb, learn_scale, noise_correlation, return_log_prob
+    head = action_init, scale_init, learn_scale, noise_correlation, return_log_prob
     if recurrent:
         if not num_cells:
             raise UserValueError("A memory reads the first hidden layer: give num_cells at least one, such as [64].")
@@ -110,7 +106,6 @@ def make_visual_actor(
     action_init: Tensor | None = None,
     scale_init: ScaleInit = 0.1,
     learn_scale: bool = True,
-    scale_lb: ScaleInit | None = None,
     noise_correlation: Below1 = 0.0,
     return_log_prob: bool = False,
 ) -> ProbabilisticActor:
@@ -139,7 +134,7 @@ def make_visual_actor(
         hidden_size: numbers in that memory.
         activation: of convolutions and hidden layers.
         input_scale: the vectors are multiplied by this; a number, or one for each of ``in_keys``.
-        action_init, scale_init, learn_scale, scale_lb, noise_correlation, return_log_prob: as for ``make_actor``.
+        action_init, scale_init, learn_scale, noise_correlation, return_log_prob: as for ``make_actor``.
 
     Raises:
         ValueError: the environment has no such image; or as for :func:`~torchrl_quad.make_actor`.
@@ -167,7 +162,7 @@ def make_visual_actor(
     trunk = network_of(env, in_keys, num_cells[0], [], activation, input_scale, more=seen)
     features, keys = Features(convolutions, trunk, activation()), [image_key, *in_keys]
     more = {"num_cells": list(num_cells[1:]), "activation_class": activation}
-    head = action_init, scale_init, scale_lb, learn_scale, noise_correlation, return_log_prob
+    head = action_init, scale_init, learn_scale, noise_correlation, return_log_prob
     return _composed(env, "make_visual_actor", features, keys, hidden_size if recurrent else 0, more, *head)
 
 
@@ -197,7 +192,6 @@ def _policy(
     make_last: Callable[[int], Network],
     action_init: Tensor | None,
     scale_init: float,
-    scale_lb: float | None,
     learn_scale: bool,
     rho: float,
     return_log_prob: bool,
@@ -213,9 +207,7 @@ def _policy(
         layer.weight.mul_(0.01)
         layer.bias.zero_()
         layer.bias[: len(first)] = first
-    least = min(0.01, 0.1 * scale_init) if scale_lb is None else scale_lb
-    if not least < scale_init:
-        raise UserValueError(f"scale_lb={least} must be less than scale_init={scale_init}, where training starts.")
+    least = min(0.01, 0.1 * scale_init)  # to which training can bring the scale down
     max_loc = 5.0 if return_log_prob else math.inf  # as far as TorchRL's TanhNormal goes with tanh_loc=True
     network.head = GaussianHead(len(first), f"biased_softplus_{scale_init}_{least}", max_loc, rho)
     read = [*in_keys, "noise_before"] if rho else list(in_keys)
@@ -272,6 +264,10 @@ class TanhGaussianActor(ProbabilisticActor):
         """The part that samples."""
         return self[1]
 
+    def scale_noise(self, share: float) -> None:
+        """Draw this share of the noise from now on; the scale that the policy writes stays that of all of it."""
+        cast(GaussianHead, self.last.head).drawn = share
+
     @property
     def is_random(self) -> bool | None:
         """Whether it samples, or takes the mode; None if it is asked for something else."""
@@ -293,20 +289,22 @@ class TanhGaussianActor(ProbabilisticActor):
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
         """Write loc, scale and action, the noise if it is correlated, and the log-probability if wanted."""
         head = getattr(self.last, "head", None)
-        if not isinstance(head, GaussianHead) or not head.rho:
+        is_random = self.is_random
+        if not isinstance(head, GaussianHead) or not (head.rho or (is_random and head.drawn < 1.0)):
             return super().forward(tensordict, **kwargs)
-        is_random, before = self.is_random, tensordict.get("noise", None)
+        before = tensordict.get("noise", None)
         if before is None or not is_random:
             last = cast(nn.Linear, self.last.mlp[-1])
-            before = first_noise(last.weight.new_zeros((*tensordict.batch_size, head.size)), is_random)
-        tensordict.set("noise_before", before)
+            before = head.draw(last.weight.new_zeros((*tensordict.batch_size, head.size)), is_random)
+        if head.rho:
+            tensordict.set("noise_before", before)
         if is_random is None:
             return super().forward(tensordict, **kwargs).set("noise", before)
         # Evaluated for each of the two, which fixes the order in which gradients add up.
         loc, scale = (leaf(self[0](tensordict), key) for key in ("loc", "scale"))
-        xi = first_noise(torch.zeros_like(loc.detach()), is_random)
-        written = tanh_gaussian(loc, scale, xi, self.bounds, self.log_prob_entry)
-        return tensordict.update(written).set("noise", head.next(before, xi))
+        xi = head.draw(torch.zeros_like(loc.detach()), is_random)
+        tensordict.update(tanh_gaussian(loc, scale, xi, self.bounds, self.log_prob_entry))
+        return tensordict.set("noise", head.next(before, xi)) if head.rho else tensordict
 
     def plain(self) -> PlainTanhGaussian | None:
         """The policy as pure functions of its present weights; None if its parts were changed or hooked."""

@@ -17,7 +17,7 @@ from torchrl.modules import MLP, ValueOperator
 from torchrl_quad.data.unwrap import base_env, check_env, observed
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.modules.plain import Network, layout
-from torchrl_quad.options import AfterValidator, Entries, Entry, Field, Scale, Width, checked
+from torchrl_quad.options import AfterValidator, Entries, Field, Scale, Width, checked
 
 OBSERVATION = ("observation",)
 MOST_WEIGHTS = 100_000_000  # of a network
@@ -47,23 +47,19 @@ def make_value(
     in_keys: Entries = OBSERVATION,
     activation: Activation = nn.ELU,
     input_scale: Scale | Sequence[Scale] = 1.0,
-    compressed: Sequence[Entry] = (),
 ) -> ValueOperator:
     """A state value V(s), written to ``state_value``, (*, 1).
 
     LayerNorm normalises its hidden layers: without it the gradient of the critic, which the policy follows, is far off.
     A critic may read more than the actor does, such as ``in_keys=("observation", ("state", "rotor_speed"))``. Rotors
     turn at some 1000 rad/s, and ``input_scale=(1.0, 1e-3)`` brings both entries to about one. Among obstacles,
-    ``"obstacle"`` (*, 4) is the distance to the nearest [m], and the direction away from it in the body frame. Terms of
-    the reward, such as ``("reward_terms", "position")``, show it how near the best state is.
+    ``"obstacle"`` (*, 4) is the distance to the nearest [m], and the direction away from it in the body frame.
 
     Args:
         env, activation, input_scale, in_keys: as for :func:`~torchrl_quad.make_actor`, and so are the errors.
         num_cells: the width of every hidden layer, in a list: [64, 64], or [64] for a single layer.
-        compressed: those of ``in_keys`` that it reads as sign(x) log(1 + |x|) of the scaled x (Hafner et al. 2023,
-            arXiv:2301.04104), such as terms that are large where they are paid once.
     """
-    net = network_of(env, in_keys, 1, num_cells, activation, input_scale, layer_norm=True, compressed=compressed)
+    net = network_of(env, in_keys, 1, num_cells, activation, input_scale, layer_norm=True)
     return Critic(net, in_keys)
 
 
@@ -75,7 +71,6 @@ def make_qvalue(
     in_keys: Entries = OBSERVATION,
     activation: Activation = nn.ELU,
     input_scale: Scale | Sequence[Scale] = 1.0,
-    compressed: Sequence[Entry] = (),
     action_scale: Scale = 0.3,
 ) -> ValueOperator:
     """A state-action value Q(s, a), written to ``state_action_value``, (*, 1); otherwise as :func:`make_value`.
@@ -83,13 +78,11 @@ def make_qvalue(
     Args:
         env, activation, input_scale, in_keys: as for :func:`~torchrl_quad.make_actor`, and so are the errors.
         num_cells: the width of every hidden layer, in a list: [64, 64], or [64] for a single layer.
-        compressed: as for :func:`make_value`.
         action_scale: the action is multiplied by this. It reveals the state, and a critic that reads the state off it
             gets its gradient in the action wrong: below one it relies on the state first.
     """
     in_keys = [*in_keys, "action"]
-    options: Any = {"layer_norm": True, "compressed": compressed}
-    net = network_of(env, in_keys, 1, num_cells, activation, input_scale, action_scale, **options)
+    net = network_of(env, in_keys, 1, num_cells, activation, input_scale, action_scale, layer_norm=True)
     return Critic(net, in_keys)
 
 
@@ -162,7 +155,6 @@ def network_of(
     action_scale: float | None = None,
     layer_norm: bool = False,
     more: int = 0,
-    compressed: Sequence[NestedKey] = (),
 ) -> Network:
     """A network on entries of an environment; before them it reads ``more`` numbers."""
     check_env(env)
@@ -194,9 +186,7 @@ def network_of(
         device=env.device,
     )
     dtype = next((spec.dtype for spec in specs if spec.dtype.is_floating_point), None)
-    if unknown := [key for key in compressed if key not in in_keys]:
-        raise UserValueError(f"compressed must be some of in_keys, {', '.join(map(str, in_keys))}; got {unknown[0]!r}.")
-    return Network(mlp.to(dtype), scales, widths, [list(in_keys).index(key) for key in compressed])
+    return Network(mlp.to(dtype), scales, widths)
 
 
 def _single(env: EnvBase) -> EnvBase:

@@ -37,6 +37,11 @@ class GaussianHead(NormalParamExtractor):
         super().__init__(scale_mapping=scale_mapping)
         self.size, self.max_loc = size, max_loc
         self.rho, self.rest = rho, math.sqrt(1.0 - rho**2)
+        self.drawn = 1.0  # the share of the noise that is drawn
+
+    def draw(self, x: Tensor, is_random: bool | None) -> Tensor:
+        """The new part of the noise into zeros (*, k), which stay where nothing is random."""
+        return x.normal_(std=self.drawn) if is_random else x
 
     def forward(self, raw: Tensor, *before: Tensor) -> tuple[Tensor, Tensor]:  # pyrefly: ignore[bad-override]  # 1 input
         """loc and scale (*, k), from both (*, 2k), or from loc alone (*, k): the scale stays what it starts as."""
@@ -82,11 +87,11 @@ def log_density(x: Tensor, loc: Tensor, scale: Tensor, bounds: tuple[Tensor, Ten
 
 
 class Network(nn.Module):
-    """A multi-layer perceptron on its inputs of ``widths``, joined by :func:`concatenated`."""
+    """A multi-layer perceptron on the concatenation of its inputs of ``widths``, each times one of ``scales``."""
 
-    def __init__(self, mlp: MLP, scales: Sequence[float], widths: Sequence[int], compressed: Sequence[int] = ()):
+    def __init__(self, mlp: MLP, scales: Sequence[float], widths: Sequence[int]) -> None:
         super().__init__()
-        self.mlp, self.scales, self.widths, self.compressed = mlp, tuple(scales), tuple(widths), tuple(compressed)
+        self.mlp, self.scales, self.widths = mlp, tuple(scales), tuple(widths)
         self.head: nn.Module = nn.Identity()
         self.is_plain = all(isinstance(x, nn.Linear | nn.LayerNorm) or is_pointwise(x) for x in mlp)
 
@@ -103,7 +108,7 @@ class Network(nn.Module):
                 f"This network was built for entries of {', '.join(map(str, self.widths))} numbers, and reads some of "
                 f"{', '.join(map(str, found))}: those of another environment, or of other options. Build one for this."
             )
-        return concatenated(inputs, self.scales, self.compressed)
+        return concatenated(inputs, self.scales)
 
 
 class PlainTanhGaussian:
@@ -159,21 +164,21 @@ class PlainTanhGaussian:
         return fits and all((x.dtype, x.device) == (like.dtype, like.device) for x in read)
 
     def drawn(self, steps: int, n: int, before: Mapping[NestedKey, Tensor]) -> Tensor:
-        """Standard normal noise, as the distribution would draw it step by step; zeros for the mode.
+        """The noise, as the policy would draw it step by step; zeros for the mode.
 
         Noise that is correlated in time comes with that of the step before, (steps, n, 2 size).
         """
         noise = self.weights[0].new_zeros((steps, n, self.size))
         if not self.rho:
-            for x in noise if self.is_random else ():
-                x.normal_()
+            for x in noise:
+                self.head.draw(x, self.is_random)
             return noise
         last = before.get("noise") if self.is_random else None
-        last = first_noise(torch.zeros_like(noise[0]), self.is_random) if last is None else last
+        last = self.head.draw(torch.zeros_like(noise[0]), self.is_random) if last is None else last
         earlier = []
         for x in noise:
             earlier.append(last)
-            last = self.head.next(last, x.normal_() if self.is_random else x)
+            last = self.head.next(last, self.head.draw(x, self.is_random))
         return torch.cat((noise, torch.stack(earlier)), -1)
 
     def drawn_again(self, tensordict: TensorDictBase) -> Tensor:
@@ -350,15 +355,9 @@ class PlainTanhGaussian:
         return {key: written[key] for key in self.out_keys if key in written}
 
 
-def first_noise(x: Tensor, is_random: bool | None) -> Tensor:
-    """Standard normal numbers into zeros (*, k), or the zeros where nothing is random."""
-    return x.normal_() if is_random else x
-
-
-def concatenated(inputs: Sequence[Tensor], scales: Sequence[float], compressed: Sequence[int] = ()) -> Tensor:
-    """Vectors (*, k_i), each times its scale, as one; those at the places ``compressed`` as sign(x) log(1 + |x|)."""
-    parts = [x if scale == 1.0 else x * scale for x, scale in zip(inputs, scales, strict=True)]
-    return torch.cat([x.sign() * x.abs().log1p() if i in compressed else x for i, x in enumerate(parts)], -1)
+def concatenated(inputs: Sequence[Tensor], scales: Sequence[float]) -> Tensor:
+    """Vectors (*, k_i), each times its scale, as one."""
+    return torch.cat([x if scale == 1.0 else x * scale for x, scale in zip(inputs, scales, strict=True)], -1)
 
 
 def layout(network: nn.Module) -> list[Any]:

@@ -97,9 +97,7 @@ def task_of(env: EnvBase) -> QuadrotorEnv:
 def make_policy(cfg: DictConfig, env: EnvBase) -> TensorDictModule:
     """Build the policy of a configuration, which reads the depth images of a camera if there is one."""
     log_prob = "entropy_bonus" in cfg.loss or cfg.loss.get("alpha", 0) != 0  # of PPO, or of an entropy bonus
-    options = network(cfg, "actor") | {
-        x: cfg.actor[x] for x in ("scale_init", "learn_scale", "scale_lb", "noise_correlation")
-    }
+    options = network(cfg, "actor") | {x: cfg.actor[x] for x in ("scale_init", "noise_correlation", "learn_scale")}
     sees = cfg.actor.vision and "depth" in observed(env)
     remembers = sees or bool(privileged(env))
     options |= {"recurrent": remembers if cfg.actor.recurrent is None else cfg.actor.recurrent}
@@ -120,19 +118,9 @@ def network(cfg: DictConfig, name: str, env: EnvBase | None = None) -> dict[str,
         scale = section.input_scale  # one, or one for each entry
         return options | {"in_keys": keys, "input_scale": plain(scale) if OmegaConf.is_list(scale) else scale}
     if env is not None:
-        errors = terms(env) if section.get("reward_terms") else {}
-        options |= {"compressed": list(errors)} if errors else {}
-        more = errors | privileged(env)
-        more |= {"obstacle": 1.0} if "obstacle" in observed(env) else {}  # of which there are images
+        more = privileged(env) | ({"obstacle": 1.0} if "obstacle" in observed(env) else {})  # of which there are images
         options |= {"in_keys": ["observation", *more], "input_scale": [scale, *more.values()]}
     return options
-
-
-def terms(env: EnvBase) -> dict[NestedKey, float]:
-    """The reward's terms of a task, if it writes them, each with one over its weight: the errors behind it."""
-    weights = getattr(base_env(env), "weights", {})
-    found = [key for key in observed(env).keys(True, True) if key[0] == "reward_terms"]
-    return {key: 1.0 / (weights.get(key[1]) or 1.0) for key in found}
 
 
 def privileged(env: EnvBase) -> dict[NestedKey, float]:

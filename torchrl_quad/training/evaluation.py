@@ -25,7 +25,7 @@ from torchrl_quad.files import replacing
 from torchrl_quad.training.building import build_env, make_policy, task_of
 from torchrl_quad.training.checkpoints import fits, read_checkpoint, saved_config
 
-SOLVED = 0.98  # of an evaluation's episodes: a run that has never solved so many neither stalls nor ends early
+SOLVED = 0.98  # of an evaluation's episodes: a run that has never solved so many does not end early
 
 
 def evaluate(
@@ -89,19 +89,19 @@ def last_rise(rows: Sequence[Mapping[str, float]]) -> int:
     return rose
 
 
-def has_levelled_off(rows: Sequence[Mapping[str, float]], patience: float | None, least: int = 30) -> bool:
-    """Whether no evaluation of a run has risen for a share ``patience`` of it; never where that is None.
+def stalls(
+    rows: Sequence[Mapping[str, float]], since: int, patience: float | None, least: int = 10, solved: float = 0.5
+) -> bool:
+    """Whether no evaluation has risen since the step ``since``, for ``least`` of them and a share ``patience`` of the
+    run; never where ``patience`` is None.
 
-    A run of fewer than ``least`` evaluations goes on; half as many do where the returns since the last rise have stayed
-    within 2 % of the highest. So does one that has never solved the share ``SOLVED`` of an evaluation's episodes, since
-    returns stay level for long before a task is solved.
+    Nor does a run stall that has never solved the share ``solved`` of an evaluation's episodes, since returns stay
+    level for long before a task is solved.
     """
-    if patience is None or not rows or max(row["eval/solved"] for row in rows) < SOLVED:
+    if patience is None or not rows or max(row["eval/solved"] for row in rows) < solved:
         return False
-    rose, steps = last_rise(rows), rows[-1]["steps"]
-    since = [row["eval/return"] for row in rows if row["steps"] >= rose]
-    is_steady = min(since) >= max(since) - 0.02 * abs(max(since))
-    return len(rows) >= (least // 2 if is_steady else least) and rose <= (1.0 - patience) * steps
+    since = max(since, last_rise(rows))
+    return sum(row["steps"] > since for row in rows) >= least and since <= (1.0 - patience) * rows[-1]["steps"]
 
 
 def has_lost_its_way(rows: Sequence[Mapping[str, float]], patience: float | None) -> bool:
@@ -118,32 +118,28 @@ def has_lost_its_way(rows: Sequence[Mapping[str, float]], patience: float | None
     return not rows[-1]["eval/return"] >= max(returns) - 0.1 * (max(returns) - min(returns))
 
 
-def next_pace(rows: Sequence[Mapping[str, float]], since: int, patience: float | None, least: int = 10) -> float:
-    """By what the actor's rate changes after a run's last evaluation: a quarter where it stalls, 2 where it rises.
+def has_levelled_off(rows: Sequence[Mapping[str, float]], since: int, patience: float | None) -> bool:
+    """Whether a run that has solved a task stalls again after it has slowed down in the step ``since``."""
+    return since > last_rise(rows) and stalls(rows, since, patience, solved=SOLVED)
 
-    A run that has solved the share ``SOLVED`` of an evaluation's episodes stalls where none has risen for two thirds of
-    the patience, and at least ``least`` of them have passed since the last rise and since the step ``since``.
-    """
-    if patience is None:
-        return 1.0
-    if (rose := last_rise(rows)) == rows[-1]["steps"]:
-        return 2.0
-    since = max(since, rose)
-    waited = sum(row["steps"] > since for row in rows) >= least and max(row["eval/solved"] for row in rows) >= SOLVED
-    return 0.25 if waited and since <= (1.0 - patience * 2 / 3) * rows[-1]["steps"] else 1.0
+
+def next_pace(rows: Sequence[Mapping[str, float]], since: int, patience: float | None) -> float:
+    """By what the actor's rate changes after a run's last evaluation: a quarter where it stalls, a half where it has
+    lost its way, 2 where it rises."""
+    if stalls(rows, since, patience):
+        return 0.25
+    if has_lost_its_way(rows, patience):
+        return 0.5
+    return 2.0 if patience is not None and last_rise(rows) == rows[-1]["steps"] else 1.0
 
 
 def looks_ahead(rows: Sequence[Mapping[str, float]], patience: float | None) -> bool:
-    """Whether a run has solved nine tenths of an evaluation's episodes, or has once levelled off without.
+    """Whether a run has solved nine tenths of an evaluation's episodes, or has once stalled without.
 
-    That is for half of its patience, and after 30 evaluations at the earliest; not where ``patience`` is None.
+    That is after 30 evaluations at the earliest; not where ``patience`` is None.
     """
-    if any(row["eval/solved"] >= 0.9 for row in rows):
-        return True
-    if patience is None:
-        return False
     ends = range(30, len(rows) + 1)
-    return any(last_rise(rows[:n]) <= (1.0 - patience / 2) * rows[n - 1]["steps"] for n in ends)
+    return any(row["eval/solved"] >= 0.9 for row in rows) or any(stalls(rows[:n], 0, patience, solved=0) for n in ends)
 
 
 @contextlib.contextmanager

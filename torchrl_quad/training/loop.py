@@ -51,7 +51,6 @@ from torchrl_quad.training.evaluation import (
     evaluate,
     final_evaluation,
     has_levelled_off,
-    has_lost_its_way,
     last_rise,
     looks_ahead,
     merit,
@@ -72,8 +71,8 @@ class Run:
 
     Every ``eval.interval`` iterations the run writes a row of metrics and a checkpoint, which holds all that it needs
     to continue bit for bit, and the best policy so far, by :func:`merit`, which flies from other starts at the end.
-    With ``eval.patience`` a run that has lost its way goes back to it, with its critics and optimisers; so does a run
-    that has stalled, at a quarter of the actor's rate, which doubles with each evaluation that rises again.
+    With ``eval.patience`` a run that has stalled goes back to it, with its critics and optimisers, at a quarter of the
+    actor's rate; so does a run that has lost its way, at half of it. Each evaluation that rises doubles the rate again.
 
     The seconds are those of the loop, without set-up, compilation, evaluations and checkpoints.
 
@@ -86,8 +85,9 @@ class Run:
     Attributes:
         carry: where the next horizon starts; the algorithm sets it in each iteration.
         horizon: control steps of this iteration's rollout, ``cfg.horizon`` unless the algorithm sets it.
-        levelled_off: whether its evaluations have, by ``eval.patience``; then it ends.
-        looks_ahead: whether nine tenths of an evaluation have once been solved, or it has levelled off.
+        levelled_off: whether it has stalled again at the lower rate; then it ends.
+        looks_ahead: whether nine tenths of an evaluation have once been solved, or it has stalled.
+        pace: the share of its schedule's rate that the actor learns with.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class Run:
         self.starts: list[Tensor] = []  # positions in which the horizons since the last row have started
         self.rows: list[dict[str, float]] = []  # of metrics.csv
         self.iteration, self.seconds, self.processor_seconds, self.skipped, self.slower_since = 0, 0.0, 0.0, 0, 0
-        self.pace = 1.0  # the share of its schedule's rate that the actor learns with
+        self.pace = 1.0
         self.best: dict[str, Any] = {"solved": -math.inf, "return": -math.inf}
         self.folder = Path(HydraConfig.get().runtime.output_dir)
         self.saved: Path | None = None  # the last checkpoint known to be intact
@@ -125,7 +125,7 @@ class Run:
             self.carry = env.reset()
         self.evaluated = self.rows[-1]["iteration"] if self.rows else 0  # known to all processes, as rows are not
         self.looks_ahead = looks_ahead(self.rows, cfg.eval.patience)
-        self.levelled_off = has_levelled_off(self.rows, cfg.eval.patience)
+        self.levelled_off = has_levelled_off(self.rows, self.slower_since, cfg.eval.patience)
         self.is_over = not self.goes_on and (self.folder / "summary.json").exists()
         if rank() == 0 and not self.is_over:
             for name in ("summary.json", "failure.pt"):  # of the run before it was made longer, or went on
@@ -186,15 +186,16 @@ class Run:
                         metrics = self._evaluate()
                         solved = metrics["eval/solved"]
                         bar.set_postfix_str(f"return {metrics['eval/return']:.2f}, solved {solved:.0%}")
-                        self.looks_ahead = looks_ahead(self.rows, self.cfg.eval.patience)
-                        self.levelled_off = has_levelled_off(self.rows, self.cfg.eval.patience)
-                        pace = next_pace(self.rows, self.slower_since, self.cfg.eval.patience)
-                        if pace < 1.0 or has_lost_its_way(self.rows, self.cfg.eval.patience):
+                        since, patience = self.slower_since, self.cfg.eval.patience
+                        self.looks_ahead = looks_ahead(self.rows, patience)
+                        self.levelled_off = has_levelled_off(self.rows, since, patience)
+                        pace = 1.0 if self.levelled_off else next_pace(self.rows, since, patience)
+                        if pace < 1.0:
                             best = self.best.get("stateful")
                     known = self.looks_ahead, self.levelled_off, best, pace
                     self.looks_ahead, self.levelled_off, best, pace = of_first(known)
                     self.pace = min(max(pace * self.pace, 1 / 16), 1.0)
-                    if pace < 1.0:
+                    if pace == 0.25:  # it has stalled
                         self.slower_since = self.steps
                     if best is not None:
                         self._roll_back(best)

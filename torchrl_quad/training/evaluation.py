@@ -76,7 +76,7 @@ def merit(score: Mapping[str, float], patience: float | None) -> tuple[float, fl
 
 def last_rise(rows: Sequence[Mapping[str, float]]) -> int:
     """The step of a run's last evaluation that rose: by 1 % of the episodes, or of the highest return or the range of
-    returns, whichever is larger."""
+    returns, whichever is larger. A policy that solves more may return less; from there on its return counts."""
     rose, lowest, highest, solved = 0, math.inf, -math.inf, 0.0
     for row in rows:
         if not math.isfinite(found := row["eval/return"]):
@@ -85,7 +85,7 @@ def last_rise(rows: Sequence[Mapping[str, float]]) -> int:
         if highest == -math.inf or found > highest + 0.01 * max(highest - lowest, abs(highest)):
             rose, highest = int(row["steps"]), found
         if row["eval/solved"] > solved + 0.01:
-            rose, solved = int(row["steps"]), row["eval/solved"]
+            rose, solved, highest = int(row["steps"]), row["eval/solved"], found
     return rose
 
 

@@ -1,4 +1,4 @@
-"""One setting for every task: AHAC with one set of numbers; scale, discount, horizon and end follow from the run.
+"""One setting for every task: AHAC with one set of numbers; scale, discount, noise and end follow from the run.
 
 python recipes/train.py task=hovering seed=0
 """

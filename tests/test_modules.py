@@ -202,6 +202,16 @@ def test_a_new_action_at_the_end_of_a_horizon_has_the_noise_of_the_policy_itself
     assert torch.atanh(action).std(0).mean() == pytest.approx(0.3, rel=0.05)
 
 
+@cases((0.1, 0.01), (0.03, 0.003))
+def test_training_cannot_bring_the_noise_below_a_bound(scale_init, least):
+    env = HoveringEnv(num_envs=2)
+    actor = make_actor(env, scale_init=scale_init)
+    assert actor(env.reset())["scale"][0].tolist() == pytest.approx(4 * [scale_init], rel=0.05)
+    with torch.no_grad():
+        list(actor.parameters())[-1][4:] = -100.0
+    assert actor(env.reset())["scale"][0].tolist() == pytest.approx(4 * [least], rel=1e-4)
+
+
 @pytest.mark.parametrize("options", [{}, {"noise_correlation": 0.9}, {"recurrent": True}])
 def test_a_policy_draws_a_share_of_its_noise_in_flights_and_calls(options):
     env = HoveringEnv(num_envs=4000)
@@ -209,8 +219,9 @@ def test_a_policy_draws_a_share_of_its_noise_in_flights_and_calls(options):
     start, wide = differentiable_rollout(env, actor, None, 1)[0][:, 0], []
     for share in (1.0, 0.25):
         actor.scale_noise(share)
-        with set_exploration_type(ExplorationType.RANDOM):
+        with torch.random.fork_rng(), set_exploration_type(ExplorationType.RANDOM):
             called = actor(start.exclude("noise"))
-        flown = differentiable_rollout(env, actor, None, 1)[0][:, 0]
-        wide.append([(td["action"].atanh() - td["loc"]).std().item() for td in (called, flown)])
-    assert wide[1] == pytest.approx([0.25 * x for x in wide[0]], rel=0.05)
+        flown = differentiable_rollout(env, actor, start.exclude("noise"), 1)[0][:, 0]
+        torch.testing.assert_close(called["action"], flown["action"])
+        wide.append((flown["action"].atanh() - flown["loc"]).std().item())
+    assert wide[1] == pytest.approx(0.25 * wide[0], rel=0.05)

@@ -65,7 +65,7 @@ def make_actor(
         action_init: the mean action at the start, (k), strictly between the bounds. By default ``env.neutral_action``
             (see :mod:`torchrl_quad.data`; a drone's is to hover), or the middle of the range.
         scale_init: the standard deviation of the policy's noise at the start, before the tanh, in units of half the
-            range. Training brings it down to 0.01 at least, or to a tenth of this.
+            range. Training cannot bring it below 0.01, or below a tenth of this if that is less.
         learn_scale: whether this noise changes with the state and in training. Otherwise neither a gradient through the
             simulator nor a KL bound takes the exploration away.
         noise_correlation: of the policy's noise in two consecutive steps; 0 is white noise, which averages out; try 0.9
@@ -265,8 +265,11 @@ class TanhGaussianActor(ProbabilisticActor):
         return self[1]
 
     def scale_noise(self, share: float) -> None:
-        """Draw this share of the noise from now on; the scale that the policy writes stays that of all of it."""
-        cast(GaussianHead, self.last.head).drawn = share
+        """Draw only this share of the noise from now on.
+
+        ``scale`` and the log-probability stay those of the whole noise; copies and checkpoints do not know the share.
+        """
+        cast(GaussianHead, self.last.head).share = share
 
     @property
     def is_random(self) -> bool | None:
@@ -289,22 +292,22 @@ class TanhGaussianActor(ProbabilisticActor):
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
         """Write loc, scale and action, the noise if it is correlated, and the log-probability if wanted."""
         head = getattr(self.last, "head", None)
-        is_random = self.is_random
-        if not isinstance(head, GaussianHead) or not (head.rho or (is_random and head.drawn < 1.0)):
+        if not isinstance(head, GaussianHead) or not (head.rho or (self.is_random and head.share != 1.0)):
             return super().forward(tensordict, **kwargs)
-        before = tensordict.get("noise", None)
-        if before is None or not is_random:
-            last = cast(nn.Linear, self.last.mlp[-1])
-            before = head.draw(last.weight.new_zeros((*tensordict.batch_size, head.size)), is_random)
+        is_random = self.is_random
         if head.rho:
+            before = tensordict.get("noise", None)
+            if before is None or not is_random:
+                last = cast(nn.Linear, self.last.mlp[-1])
+                before = head.draw(last.weight.new_zeros((*tensordict.batch_size, head.size)), is_random)
             tensordict.set("noise_before", before)
-        if is_random is None:
-            return super().forward(tensordict, **kwargs).set("noise", before)
+            if is_random is None:
+                return super().forward(tensordict, **kwargs).set("noise", before)
         # Evaluated for each of the two, which fixes the order in which gradients add up.
         loc, scale = (leaf(self[0](tensordict), key) for key in ("loc", "scale"))
         xi = head.draw(torch.zeros_like(loc.detach()), is_random)
         tensordict.update(tanh_gaussian(loc, scale, xi, self.bounds, self.log_prob_entry))
-        return tensordict.set("noise", head.next(before, xi)) if head.rho else tensordict
+        return tensordict.set("noise", head.next(leaf(tensordict, "noise_before"), xi)) if head.rho else tensordict
 
     def plain(self) -> PlainTanhGaussian | None:
         """The policy as pure functions of its present weights; None if its parts were changed or hooked."""

@@ -28,20 +28,20 @@ class GaussianHead(NormalParamExtractor):
     """The normal distribution of an action, from what a network returns and, if rho > 0, the noise of the step before.
 
     With noise e_t = rho e_(t-1) + sqrt(1 - rho^2) xi_t the action mu + sigma e_t, of ``size`` k, has mean
-    mu + rho sigma e_(t-1) and standard deviation sigma sqrt(1 - rho^2). Each e_t is standard normal: the noise is as
-    large as without correlation. ``max_loc`` bounds mu: beyond 7.25 tanh is clipped, and an action no longer determines
-    what was drawn, so that its log-probability falls without bound.
+    mu + rho sigma e_(t-1) and standard deviation sigma sqrt(1 - rho^2). Each e_t is standard normal, times ``share``:
+    the noise is as large as without correlation. ``max_loc`` bounds mu: beyond 7.25 tanh is clipped, and an action no
+    longer determines what was drawn, so that its log-probability falls without bound.
     """
 
     def __init__(self, size: int, scale_mapping: str, max_loc: float = math.inf, rho: float = 0.0) -> None:
         super().__init__(scale_mapping=scale_mapping)
         self.size, self.max_loc = size, max_loc
         self.rho, self.rest = rho, math.sqrt(1.0 - rho**2)
-        self.drawn = 1.0  # the share of the noise that is drawn
+        self.share = 1.0  # of the noise that is drawn
 
     def draw(self, x: Tensor, is_random: bool | None) -> Tensor:
-        """The new part of the noise into zeros (*, k), which stay where nothing is random."""
-        return x.normal_(std=self.drawn) if is_random else x
+        """Fill zeros (*, k) with the new part of the noise; where nothing is random they stay zeros."""
+        return x.normal_(std=self.share) if is_random else x
 
     def forward(self, raw: Tensor, *before: Tensor) -> tuple[Tensor, Tensor]:  # pyrefly: ignore[bad-override]  # 1 input
         """loc and scale (*, k), from both (*, 2k), or from loc alone (*, k): the scale stays what it starts as."""
@@ -61,7 +61,7 @@ class GaussianHead(NormalParamExtractor):
 def tanh_gaussian(
     loc: Tensor, scale: Tensor, noise: Tensor, bounds: tuple[Tensor, Tensor] | None, log_prob_key: NestedKey | None
 ) -> dict[NestedKey, Tensor]:
-    """loc, scale, the action (*, k) that standard normal noise makes of them, and its log-probability (*) if wanted."""
+    """loc, scale, the action (*, k) that noise makes of them, and its log-probability (*) if wanted."""
     x = loc + scale * noise
     limit = 1.0 - torch.finfo(x.dtype).resolution
     squashed = torch.tanh(x)

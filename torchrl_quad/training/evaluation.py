@@ -119,27 +119,29 @@ def has_lost_its_way(rows: Sequence[Mapping[str, float]], patience: float | None
 
 
 def has_levelled_off(rows: Sequence[Mapping[str, float]], since: int, patience: float | None) -> bool:
-    """Whether a run that has solved a task stalls again after it has slowed down in the step ``since``."""
+    """Whether a run that has solved a task stalls again after the stall in the step ``since``, with no rise between."""
     return since > last_rise(rows) and stalls(rows, since, patience, solved=SOLVED)
+
+
+STALLED = 0.25  # by which a stall changes the pace
 
 
 def next_pace(rows: Sequence[Mapping[str, float]], since: int, patience: float | None) -> float:
     """By what the actor's rate changes after a run's last evaluation: a quarter where it stalls, a half where it has
     lost its way, 2 where it rises."""
     if stalls(rows, since, patience):
-        return 0.25
+        return STALLED
     if has_lost_its_way(rows, patience):
         return 0.5
     return 2.0 if patience is not None and last_rise(rows) == rows[-1]["steps"] else 1.0
 
 
 def looks_ahead(rows: Sequence[Mapping[str, float]], patience: float | None) -> bool:
-    """Whether a run has solved nine tenths of an evaluation's episodes, or has once stalled without.
-
-    That is after 30 evaluations at the earliest; not where ``patience`` is None.
-    """
-    ends = range(30, len(rows) + 1)
-    return any(row["eval/solved"] >= 0.9 for row in rows) or any(stalls(rows[:n], 0, patience, solved=0) for n in ends)
+    """Whether a run has solved nine tenths of an evaluation's episodes, or has once stalled after 30 evaluations or
+    more, however few it solved."""
+    if any(row["eval/solved"] >= 0.9 for row in rows):
+        return True
+    return patience is not None and any(stalls(rows[:n], 0, patience, solved=0) for n in range(30, len(rows) + 1))
 
 
 @contextlib.contextmanager

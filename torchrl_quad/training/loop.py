@@ -46,6 +46,7 @@ from torchrl_quad.training.building import (
 )
 from torchrl_quad.training.checkpoints import fits, read_checkpoint, revision, write_checkpoint
 from torchrl_quad.training.evaluation import (
+    STALLED,
     best_policy,
     drawing_from,
     evaluate,
@@ -86,7 +87,7 @@ class Run:
         carry: where the next horizon starts; the algorithm sets it in each iteration.
         horizon: control steps of this iteration's rollout, ``cfg.horizon`` unless the algorithm sets it.
         levelled_off: whether it has stalled again at the lower rate; then it ends.
-        looks_ahead: whether nine tenths of an evaluation have once been solved, or it has stalled.
+        looks_ahead: whether it has once solved nine tenths of an evaluation, or has long not risen.
         pace: the share of its schedule's rate that the actor learns with.
     """
 
@@ -195,7 +196,7 @@ class Run:
                     known = self.looks_ahead, self.levelled_off, best, pace
                     self.looks_ahead, self.levelled_off, best, pace = of_first(known)
                     self.pace = min(max(pace * self.pace, 1 / 16), 1.0)
-                    if pace == 0.25:  # it has stalled
+                    if pace == STALLED:
                         self.slower_since = self.steps
                     if best is not None:
                         self._roll_back(best)

@@ -124,7 +124,7 @@ SETTINGS: dict[str, tuple[Any, str]] = {
     "eval.episodes": (Size | None, "Episodes of each evaluation, at least; null for one of each drone."),
     "eval.patience": (
         Below1 | None,
-        "A run slows down, then ends, where none rises for this share; null: never.",
+        "Of a run: without a rise for so long it slows down, and ends at the second time in a row.",
     ),
     "eval.seed": (_Seed, ""),
     "logger.backend": (Literal["wandb", "tensorboard", "csv"] | None, ""),

@@ -19,10 +19,8 @@ def main(cfg: DictConfig) -> None:
     scale = ReturnScale(loss)
     run = Run(cfg, env, actor, loss, [actor_optimizer, critic_optimizer, scale])
     for _ in run:
-        # The more slowly the actor learns, the less noise shakes the drones, and the further it trusts the simulator.
-        rate = actor_optimizer.param_groups[0]["lr"]
-        share = rate / actor_optimizer.first_lr
-        actor.scale_noise(max(share, 0.25))
+        # After a stall less noise shakes the drones, and their actions follow more of the simulator and less of a critic.
+        actor.scale_noise(max(run.pace, 0.25))
         loss.gradient_lmbda = 1.0 - run.pace * (1.0 - cfg.loss.gradient_lmbda)
         # Until nine tenths of the episodes are solved, or returns level off, the discount looks half as far ahead.
         loss.value_estimator.gamma.fill_(cfg.gamma if run.looks_ahead else max(2.0 * cfg.gamma - 1.0, 0.0))
@@ -40,7 +38,9 @@ def main(cfg: DictConfig) -> None:
         # The critics: towards TD(lambda) targets, from the least of them; the more steps, the slower the actor learns.
         data = loss.write_value_target(data)
         scale.update(data)
-        critic_metrics = run.fit_critic(critic_optimizer, data, times=1 / max(share / run.pace, 1 / 3))
+        rate = actor_optimizer.param_groups[0]["lr"]
+        share = max(rate / (run.pace * actor_optimizer.first_lr), 1 / 3)
+        critic_metrics = run.fit_critic(critic_optimizer, data, times=1 / share)
 
         update_normalizer(env, rollout)
         run.carry = restart(env, end, cfg.restart_fraction)

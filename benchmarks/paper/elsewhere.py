@@ -291,8 +291,6 @@ def train_one_setting(environment: str, seed: int) -> tuple[float, float, float]
     scale, average = ReturnScale(loss), cast("AveragedModel", average_policy(cfg, actor))
 
     def iterate(_: float, carry: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        share = actor_optimizer.param_groups[0]["lr"] / actor_optimizer.first_lr
-        actor.scale_noise(max(share, 0.25))
         rollout, carry = differentiable_rollout(place.env, actor, carry, loss.horizon)
         scale.divide(rollout)
         target, metrics = loss.better_actions(rollout, cfg.step)
@@ -303,7 +301,8 @@ def train_one_setting(environment: str, seed: int) -> tuple[float, float, float]
         average.update_parameters(actor)
         data = loss.write_value_target(data)
         scale.update(data)
-        for batch in minibatches(data, cfg.critic, 1 / max(share, 1 / 3)):
+        share = max(actor_optimizer.param_groups[0]["lr"] / actor_optimizer.first_lr, 1 / 3)
+        for batch in minibatches(data, cfg.critic, 1 / share):
             optimise(critic_optimizer, loss.loss_value(batch)[0], cfg.critic.max_grad_norm)
         loss.adapt_horizon(metrics["stiffness"])
         return rollout, carry

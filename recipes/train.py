@@ -19,7 +19,7 @@ def main(cfg: DictConfig) -> None:
     scale = ReturnScale(loss)
     run = Run(cfg, env, actor, loss, [actor_optimizer, critic_optimizer, scale])
     for _ in run:
-        # After a stall less noise shakes the drones, and their actions follow more of the simulator and less of a critic.
+        # After a stall less noise shakes the drones, and actions follow the simulator further before the critic.
         actor.scale_noise(max(run.pace, 0.25))
         loss.gradient_lmbda = 1.0 - run.pace * (1.0 - cfg.loss.gradient_lmbda)
         # Until nine tenths of the episodes are solved, or returns level off, the discount looks half as far ahead.

@@ -161,12 +161,8 @@ def test_a_run_stalls_when_no_evaluation_has_risen_for_a_share_of_it_and_levels_
     low = [row | {"eval/solved": 0.4} for row in curve]
     assert not stalls(low, 0, 0.5, least=6)  # the task is not solved
     later = [row | {"steps": 100.0 + 10 * i} for i, row in enumerate(curve[-1:] * 20)]
-    assert [has_levelled_off(curve + later, since, 0.5) for since in (0, 40, 50, 140, 150)] == [
-        False,
-        False,
-        *[True] * 2,
-        False,
-    ]
+    level = [has_levelled_off(curve + later, since, 0.5) for since in (0, 40, 50, 140, 150)]
+    assert level == [False, False, True, True, False]
     assert not has_levelled_off([row | {"eval/solved": 0.97} for row in curve + later], 50, 0.5)
     later = [row | {"eval/solved": 0.4} for row in later]
     assert [looks_ahead(rows, 0.6) for rows in ([], low[:1], low, low + later)] == [False, False, False, True]

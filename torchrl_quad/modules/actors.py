@@ -292,7 +292,7 @@ class TanhGaussianActor(ProbabilisticActor):
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
         """Write loc, scale and action, the noise if it is correlated, and the log-probability if wanted."""
         head = getattr(self.last, "head", None)
-        if not isinstance(head, GaussianHead) or not (head.rho or (self.is_random and head.share != 1.0)):
+        if not isinstance(head, GaussianHead) or not (head.rho or (head.share != 1.0 and self.is_random)):
             return super().forward(tensordict, **kwargs)
         is_random = self.is_random
         if head.rho:

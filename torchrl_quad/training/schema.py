@@ -124,7 +124,7 @@ SETTINGS: dict[str, tuple[Any, str]] = {
     "eval.episodes": (Size | None, "Episodes of each evaluation, at least; null for one of each drone."),
     "eval.patience": (
         Below1 | None,
-        "Of a run: without a rise for so long it slows down, and ends at the second time in a row.",
+        "Of a run: without a rise for so long it slows down, and ends the second time in a row; null: never.",
     ),
     "eval.seed": (_Seed, ""),
     "logger.backend": (Literal["wandb", "tensorboard", "csv"] | None, ""),

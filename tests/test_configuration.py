@@ -119,8 +119,19 @@ def test_recipes_pass_the_schema_on_tasks_that_they_are_not_tuned_for_and_one_ha
     found = {run: composed(run[0], f"task={run[1]}") for run in sorted(missing)}
     for cfg in found.values():
         check(cfg)
-    one = [OmegaConf.masked_copy(found["train", task], settings("train").keys() - {"task", "env"}) for task in TASKS]
+    one = [plain(found["train", task]) | {"task": "", "env": {}} for task in TASKS]  # times of its env not resolved
     assert all(cfg == one[0] for cfg in one)
+
+
+@pytest.mark.parametrize("period", [0.005, 0.02, 0.04])
+def test_one_setting_spans_the_same_times_at_every_control_period(period):
+    cfg = composed("train", f"env.control_dt={period}")
+    check(cfg)
+    lasting = cfg.gamma, cfg.env.event_discount, cfg.critic.lmbda, cfg.loss.gradient_lmbda, cfg.actor.noise_correlation
+    times = [cfg.horizon * period, *(period / (1.0 - share) for share in lasting)]
+    assert times == pytest.approx([1.28, 2.0, 2.0, 0.4, 1.0, 0.2])
+    cfg = composed("train", "env.control_dt=1", "env.dt=0.02", "horizon=64")  # what is shorter than a step
+    assert (cfg.horizon, cfg.actor.noise_correlation, cfg.gamma) == (64, 0.0, 0.5)
 
 
 @pytest.mark.parametrize("recipe", RECIPES)

@@ -7,7 +7,7 @@ import contextlib
 import functools
 import inspect
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import NoneType
 from typing import Any, cast
@@ -28,6 +28,21 @@ _OFFERED: dict[tuple[str, str], type | None] = {}  # what is in hydra's store, b
 _SETTING = re.compile(r"--(?!cfg=|package=|info=)([\w.@/]+=.*)", re.DOTALL)
 # What Python and hydra write differently: a string, which may be a key with its colon, and None.
 _PYTHON = re.compile(r"""('(?:\\.|[^'\\])*'|"(?:\\.|[^"\\])*")(\s*:)?|(?<![^\s,\[{:])None(?![^\s,\]}])""")
+
+
+def _steps_in(seconds: float, cfg: DictConfig) -> float:
+    """Control steps in a time of train.yaml; a period that is none gets its error from the schema."""
+    period = OmegaConf.select(cfg, "env.control_dt", throw_on_resolution_failure=False)
+    return seconds / period if isinstance(period, float | int) and period > 0 else 1.0
+
+
+def _resolve(name: str, of_steps: Callable[[float], float]) -> None:
+    """Offer ``${NAME:SECONDS}`` to configurations: a function of the control steps in the time."""
+    OmegaConf.register_new_resolver(name, lambda seconds, *, _root_: of_steps(_steps_in(seconds, _root_)), replace=True)
+
+
+_resolve("steps_in", lambda steps: max(round(steps), 1))
+_resolve("decay_over", lambda steps: max(1.0 - 1.0 / steps, 0.0))  # per control step, with this time constant
 
 
 def compose(recipe: str, overrides: Iterable[str] = ()) -> DictConfig:

@@ -277,6 +277,11 @@ def test_methods_are_compared_by_interquartile_means_and_by_who_beats_whom(tmp_p
     none = Starts(tmp_path)
     (choice,) = tables.choice_table(rows, none)
     assert list(choice.values())[1:] == ["SHAC: 9.1, 99.0%, 5 s, 3 seeds", "PPO: 9.6, 100.0%, 40 s, 3 seeds", ""]
+    ends = {0: (9.3, 9.5), 1: (9.0, 9.41), 2: (9.5, 9.0), 3: (math.nan, 9.4)}  # returns after ten and twenty seconds
+    run = {"task": "hovering", "algorithm": "train"}
+    curves = [run | {"seed": s, "seconds": 10 * i, "return": x} for s, of in ends.items() for i, x in enumerate(of, 1)]
+    (choice,) = tables.choice_table(rows, none, curves)
+    assert choice.popitem() == ("One setting at 98 % of the best tuned", "20 s, 3 of 4 seeds")
     (level,) = tables.choice_table([x for x in rows if x["algorithm"] != "ppo"], none)
     assert list(level.values())[2:] == ["BPTT: 9.1, 98.0%, 3 s, 3 seeds", "SHAC"]
     speeds = {"BPTT": "333", "SHAC": "200", "ABPT": "1000", "PPO": "25"}

@@ -35,7 +35,7 @@ def make(data: Path) -> dict[str, Table]:
     results, starts, runs = Results(data), Starts(data), read_rows(data / "shipped.csv")
     made = reached_tables(runs, starts) | {
         "summary": summary_table(runs),
-        "choice": choice_table(runs, starts),
+        "choice": choice_table(runs, starts, read_rows(data / "shipped_curves.csv")),
         "improvement": improvement_table(runs),
         "speed": speed_table([*runs, *read_rows(data / "rates.csv")]),
         "ablations": ablations_table(data),
@@ -227,9 +227,10 @@ def one_setting_table(data: Path, starts: Starts) -> Table:
     return [{name: x for name, x in row.items() if name != "method"} for row in rows]
 
 
-def choice_table(rows: Sequence[Row], starts: Starts) -> Table:
-    """Show for each task the quickest method that works with every seed, and the one of the highest return."""
-    lines = []
+def choice_table(rows: Sequence[Row], starts: Starts, curves: Sequence[Row] = ()) -> Table:
+    """Show for each task the quickest method that works with every seed, and the one of the highest return; and when
+    evaluations of one setting first reach 98 % of the highest return of a tuned method, the median over seeds."""
+    lines, untuned = [], grouped([x for x in curves if x["algorithm"] == "train"], "task", "seed")
     for task, flown in in_order(rows).items():
         worst = {x: min(column(own, "solved")) for x, own in flown.items()}
         returns = {x: interquartile_mean(column(own, "return")) for x, own in flown.items()}
@@ -244,8 +245,18 @@ def choice_table(rows: Sequence[Row], starts: Starts) -> Table:
         few = f", {seeds(most_seeds)}" if most_seeds < WANTED else ""
         said = {x: f"{flights.METHODS[x]}: {returns[x]:.4g}, {worst[x]:.1%}, {seconds_of[x]:.0f} s{few}" for x in tried}
         row = {"task": LABELS.get(task, task), "quickest that works with every seed": said.get(quick, "none")}
-        lines.append(row | {"highest return": said[most], "level with it": ", ".join(level)})
+        row |= {"highest return": said[most], "level with it": ", ".join(level)}
+        goal = max(returns[x] for x in tried if x != "train")
+        if came := [until(own, goal - 0.02 * abs(goal)) for (of, _), own in untuned.items() if of == task]:
+            when = f"{np.median(came):.0f} s, " if np.median(came) < math.inf else ""
+            row["One setting at 98 % of the best tuned"] = f"{when}{np.isfinite(came).sum()} of {seeds(len(came))}"
+        lines.append(row)
     return lines
+
+
+def until(curve: Sequence[Row], level: float) -> float:
+    """Seconds until the returns of a curve reach a level; infinite where none does."""
+    return min((float(x["seconds"]) for x in curve if float(x["return"] or "nan") >= level), default=math.inf)
 
 
 def speed_table(rows: Sequence[Row]) -> Table:

@@ -2,14 +2,12 @@
 
 import pytest
 import torch
-from flying import anew, on_plain_tensors
 from refusals import refuses
 from tensordict.nn import TensorDictModule
+from test_transforms import check
 from torchrl.envs import TransformedEnv, VecNormV2, check_env_specs
-from torchrl.envs.utils import ExplorationType
 
 from torchrl_quad import HoveringEnv, ObservationNormalizer, differentiable_rollout, make_actor
-from torchrl_quad.data.transforms import normalized
 
 
 def test_the_normalizer_s_statistics_are_those_of_all_observations_seen():
@@ -51,25 +49,11 @@ def test_gradients_pass_the_normalizer_and_an_update_before_backward_changes_not
 
 
 @pytest.mark.parametrize("in_keys", [["observation"], [("state", "velocity"), "observation", ("state", "position")]])
-@pytest.mark.parametrize("is_called", [False, True])
-def test_under_the_normalizer_alone_the_environment_inside_flies_with_the_same_numbers(in_keys, is_called, monkeypatch):
-    base = HoveringEnv(num_envs=4, dtype=torch.float64, max_episode_steps=6)
-    env = TransformedEnv(base, ObservationNormalizer(base))
-    actor = make_actor(env, in_keys=in_keys, input_scale=0.7, return_log_prob=True)
-    if is_called:
-        actor[0].module.mlp[1].register_forward_hook(lambda *_: None)
-    env.transform.update(env.rollout(20, break_when_any_done=False))
-
-    def fly():
-        rollout, carry = differentiable_rollout(env, actor, anew(env, 2).reset(), 10)
-        loss = rollout["next", "reward"].sum() + rollout["next", "observation"].sum() + rollout["loc"].square().sum()
-        return dict(rollout.items(True, True)), carry, torch.autograd.grad(loss, list(actor.parameters()))
-
-    inside = fly()
-    plain = normalized(actor, env.transform).plain()
-    assert (plain is None) == is_called
-    monkeypatch.setattr("torchrl_quad.data.rollout.under_transforms", lambda env, actor: "not wanted")
-    torch.testing.assert_close(inside, fly())
+def test_under_the_normalizer_the_environment_inside_flies_with_the_numbers_and_gradients_of_torchrl_s_loop(in_keys):
+    env = HoveringEnv(num_envs=4, dtype=torch.float64)
+    normalizer = ObservationNormalizer(env)
+    normalizer.update(env.rollout(20, break_when_any_done=False))
+    check(normalizer, in_keys)
 
 
 def test_under_the_normalizer_errors_and_unwanted_outputs_stay_as_they_are():
@@ -79,20 +63,6 @@ def test_under_the_normalizer_errors_and_unwanted_outputs_stay_as_they_are():
         differentiable_rollout(env, make_actor(env), env.reset().exclude("observation"), 2)
     policy = TensorDictModule(lambda x: (x, x[:, :4].tanh()), in_keys=["observation"], out_keys=["_", "action"])
     assert differentiable_rollout(env, policy, None, 3)[0].shape == (4, 3)
-
-
-def test_a_normalized_policy_on_plain_tensors_is_the_policy():
-    env = HoveringEnv(num_envs=4, dtype=torch.float64)
-    normalizer = ObservationNormalizer(env)
-    normalizer.update(env.rollout(20))
-    actor = make_actor(env, in_keys=[("state", "velocity"), "observation"], input_scale=(0.3, 0.7))
-    td = env.reset()
-    written, plain, drawn = on_plain_tensors(normalized(actor, normalizer), td, ExplorationType.DETERMINISTIC)
-    _, mine = plain.forward(plain.weights, [td[key] for key in plain.in_keys], drawn)
-    torch.testing.assert_close(mine["action"], written["action"])
-    expected, found = (torch.autograd.grad(x["action"].sum(), list(actor.parameters())) for x in (written, mine))
-    torch.testing.assert_close(found, expected)
-    assert torch.equal(written["observation"], td["observation"])
 
 
 @pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers with non-empty batch-size:UserWarning")

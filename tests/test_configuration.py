@@ -22,10 +22,8 @@ REFUSED = [  # of ABPT, unless a recipe is named
     ("actor.final_lr=0 actor.schedule=exponential", "actor.final_lr=0: it must be above 0 with schedule=exponential"),
     ("actor.schedule=step", "actor.schedule=step: it must be 'constant', 'linear', .* or 'inverse_sqrt'"),
     ("critic.updates=null", "critic.updates=null: it must be a whole number"),
-    ("actor.scale_init=abc", "actor.scale_init=abc: it must be a number"),
     ("gamma=2", "gamma=2: it must be at most 1. .* 0.99 is usual"),
     ("gamma=nan", "gamma=nan: it must be a finite number"),
-    ("buffer.fraction=2", "buffer.fraction=2: it must be at most 1. .* null for none"),
     ("eval.interval=0", "eval.interval=0: it must be at least 1. Iterations between evaluations"),
     ("normalize=5", "normalize=5: it must be true or false"),
     ("horizon=2.5", "horizon=2.5: it must be a whole number"),
@@ -44,11 +42,8 @@ REFUSED = [  # of ABPT, unless a recipe is named
     ("+gama=0.9", "gama is unknown: this recipe has no such setting. Did you mean gamma?"),
     ("+loss.delay_value=abc", "loss.delay_value is unknown, or set by the recipe. Choose from: alpha"),
     ("ppo loss.loss_critic_type=l3", "loss.loss_critic_type=l3: it must be 'l1', 'l2' or 'smooth_l1'"),
-    ("ppo +loss.gamma=0.9", "loss.gamma is unknown, or set by the recipe"),
-    ("critic=null", "critic=null: it must be a section with settings of its own"),
     ("~critic.tau", "critic.tau is missing: do not delete it"),
     ("env.control_dt=${nothing}", "env.control_dt: Interpolation key 'nothing' not found"),
-    ("ppo loss.clip_epsilon=-1", "loss.clip_epsilon=-1: it must be greater than 0"),
     ("evaluate", "checkpoint is missing: write checkpoint=... on the command line"),
 ]
 
@@ -67,7 +62,6 @@ def test_a_setting_out_of_its_range_is_refused_with_what_to_write_instead(words,
 
 IGNORED = {  # what a person wrote, which nothing would read
     "abpt tuned=abpt": "tuned=abpt: nothing has this name in .*by_task. Choose from: abpt_",
-    "bptt +epochs=3": "epochs is unknown: this recipe has no such setting",
     "bptt +critic.updates=3": "critic is unknown: this recipe has no such setting. Leave it out.",
     "sapo +critic.tau=0.1": "critic.tau is unknown",
     "shac task=racing tuned=shac_racing_positon": "tuned=shac_racing_positon: .* Choose from: shac_racing_position",

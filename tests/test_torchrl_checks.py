@@ -1,12 +1,5 @@
-"""TorchRL's own checks of losses, for each of ours; the sentence under a test names the one that it follows.
-
-They are in pytorch/rl, test/objectives: ``_objectives_common.py`` (common), ``test_loss_module.py`` (module) and
-``test_sac.py`` (sac). Masks, keys and checkpoints have tests in ``test_loss_modules.py``, too.
-What does not apply: prioritised weights, multi-step targets and ``skip_done_states`` belong to replayed samples, and
-these losses differentiate a rollout; composite and discrete distributions have no derivative of single actions;
-``separate_losses``, ``delay_actor`` and ``action_spec`` are options of others. Value estimators are chosen by name, not
-given, since their numbers take the precision of the actor; GAE and V-trace are refused (``test_objectives.py``).
-"""
+"""TorchRL's own checks of losses, for each of ours: those of pytorch/rl, test/objectives, which each test names, in
+``_objectives_common.py`` (common), ``test_loss_module.py`` (module) and ``test_sac.py`` (sac)."""
 
 import copy
 

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, TransformedEnv, check_env_specs
 
-from torchrl_quad import HoveringEnv, differentiable_rollout, load_drone, make_actor
+from torchrl_quad import ActionSequence, HoveringEnv, differentiable_rollout, load_drone, make_actor
 from torchrl_quad.envs import TASKS
 
 OTHER = {"integrator": "rk4", "drone": "small_racer", "control_dt": 0.01, "observe_last_action": True}
@@ -97,13 +97,9 @@ def test_everything_moves_to_the_gpu():
 
 def test_episode_metrics_judge_the_first_episode_by_its_last_second():
     env = HoveringEnv(num_envs=3, max_episode_steps=60)
-    td = env.reset()
-    td["state", "position"] = td["state", "target"].clone()
-    td["state", "position"][1, 0] += 0.2  # hovers beside the target
-    td["state", "position"][2] = torch.tensor([1.0, 0.0, 5.99])
-    td["state", "velocity"][2, 2] = 5.0  # leaves the box, and starts again
-    hover = TensorDictModule(lambda _: env.hover_action.expand(3, 4), in_keys=["observation"], out_keys=["action"])
-    flight, _ = differentiable_rollout(env, hover, env.reset(td, set_state=True), 60)
+    places = [(1.0, 0.0, 1.5), (1.2, 0.0, 1.5), (1.0, 0.0, 5.99)]  # the second hovers beside the target
+    td = start(env, position=places, velocity=[(0, 0, 0), (0, 0, 0), (0, 0, 5)])  # the third leaves, and starts again
+    flight, _ = differentiable_rollout(env, ActionSequence(env.hover_action.expand(60, 3, 4)), td, 60)
     metrics = env.episode_metrics(flight)
     assert metrics["solved"].tolist() == [1.0, 0.0, 0.0] and metrics["crash"].tolist() == [0.0, 0.0, 1.0]
     assert metrics["position_error"].tolist() == pytest.approx([0.0, 0.2, 4.6], abs=0.1)

@@ -2,8 +2,7 @@
 
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
-from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
 # Drones of every kind of controller settings, for flights that would take too long with all that ship.
 FLOWN = ("crazyflie", "flightmare", "small_racer", "visfly")

@@ -10,8 +10,7 @@ from tensordict import nn as of_td
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torch.distributions import Normal
-from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal
 
 from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_qvalue, make_value

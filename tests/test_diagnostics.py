@@ -14,10 +14,9 @@ from test_loss_modules import pendulum_networks
 from torch import nn
 from torchrl.envs import PendulumEnv
 
-from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_env
+from torchrl_quad import ABPTLoss, BPTTLoss, HoveringEnv, SHACLoss, differentiable_rollout, make_actor, make_env
 from torchrl_quad.diagnostics import audit_reward, compare_gradients, gradient_by_horizon, gradient_statistics
 from torchrl_quad.envs.terms import distance
-from torchrl_quad.objectives import ABPTLoss, BPTTLoss, SHACLoss
 
 
 class Weigh(nn.Module):

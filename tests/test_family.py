@@ -12,8 +12,7 @@ from torch.distributions import Normal
 from torchrl.modules import TanhNormal
 from torchrl.objectives import ValueEstimators
 
-from torchrl_quad import ActionSequence, HoveringEnv, differentiable_rollout
-from torchrl_quad.modules import make_actor, make_qvalue, make_value
+from torchrl_quad import ActionSequence, HoveringEnv, differentiable_rollout, make_actor, make_qvalue, make_value
 from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, PODSLoss, SAPOLoss, SHACLoss
 from torchrl_quad.objectives.calls import plain_of
 

@@ -9,8 +9,7 @@ from refusals import cases, refuses
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torch._dynamo.utils import counters
-from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
 from torchrl_quad import ActionSequence, BPTTLoss, HoveringEnv, RacingEnv, audit_reward, differentiable_rollout
 from torchrl_quad.dynamics import DYNAMICS, PointMass

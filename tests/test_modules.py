@@ -9,8 +9,7 @@ from torchrl.data import Unbounded
 from torchrl.envs import CatTensors, PendulumEnv, StepCounter, TransformedEnv, UnsqueezeTransform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_quad import ABPTLoss, HoveringEnv, differentiable_rollout, load_drone
-from torchrl_quad.modules import make_actor, make_qvalue, make_value
+from torchrl_quad import ABPTLoss, HoveringEnv, differentiable_rollout, load_drone, make_actor, make_qvalue, make_value
 from torchrl_quad.objectives.calls import sample_action
 
 nan = float("nan")

@@ -15,8 +15,7 @@ from log_writers import END, TABLE, flight, ned, own_table, write_csv
 from refusals import cases, refuses
 
 import torchrl_quad
-from torchrl_quad import HoveringEnv, load_drone
-from torchrl_quad.controllers import GeometricController
+from torchrl_quad import GeometricController, HoveringEnv, load_drone
 from torchrl_quad.deploy import contract, frames
 from torchrl_quad.deploy.simulators import make_simulator, special
 from torchrl_quad.dynamics import FlightController, Quadrotor

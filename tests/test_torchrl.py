@@ -19,9 +19,8 @@ from torchrl.envs.transforms import Compose, RewardSum, StepCounter, Transformed
 from torchrl.envs.utils import step_mdp
 from torchrl.objectives import SoftUpdate
 
-from torchrl_quad import HoveringEnv, ObservationNormalizer, VisitedStateBuffer, differentiable_rollout
+from torchrl_quad import HoveringEnv, ObservationNormalizer, VisitedStateBuffer, differentiable_rollout, make_actor
 from torchrl_quad.envs import TASKS, make_env
-from torchrl_quad.modules import make_actor
 from torchrl_quad.objectives import BPTTLoss
 
 FEATURES = ["observation", ("state", "velocity")]

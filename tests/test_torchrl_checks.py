@@ -12,8 +12,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type, set_exploratio
 from torchrl.modules import ActorValueOperator, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import HardUpdate, SoftUpdate
 
-from torchrl_quad import HoveringEnv, differentiable_rollout
-from torchrl_quad.modules import make_actor, make_qvalue, make_value
+from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_qvalue, make_value
 from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss
 
 CRITICS = {"shac": SHACLoss, "sapo": SAPOLoss, "ahac": AHACLoss, "hybrid": HybridLoss, "abpt": ABPTLoss}

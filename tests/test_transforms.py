@@ -5,9 +5,8 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from tensordict.nn import TensorDictModule
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase, ExplorationType, TransformedEnv, set_exploration_type
 from torchrl.envs import transforms as T
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_visual_actor
 from torchrl_quad.data import flight_mode

@@ -9,8 +9,7 @@ from flying import anew
 from refusals import refuses
 from torch.distributions import Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
-from torchrl.envs import Compose, EnvBase, InitTracker, TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs import Compose, EnvBase, ExplorationType, InitTracker, TransformedEnv, set_exploration_type
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 

@@ -4,8 +4,7 @@ import copy
 
 import pytest
 import torch
-from flying import anew, pushed
-from refusals import cases, refuses
+from helpers import anew, cases, pushed, refuses
 from tensordict import nn as of_td
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn

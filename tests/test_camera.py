@@ -9,10 +9,9 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from flying import start
 from gymnasium.utils.env_checker import check_env
+from helpers import cases, refuses, start
 from PIL import Image
-from refusals import cases, refuses
 from stable_baselines3 import PPO
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule

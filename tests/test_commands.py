@@ -9,9 +9,9 @@ from importlib.metadata import metadata, version
 from pathlib import Path
 
 import pytest
+from helpers import ROOT, run
 from markdown_it import MarkdownIt
 from packaging.requirements import Requirement
-from small_runs import ROOT, run
 from test_docs import PAGES, code, files, importable, name_of  # noqa: F401, a fixture
 from test_examples import EXAMPLES
 from test_recipes import RECIPES, SMALL

@@ -1,8 +1,8 @@
 """The schema of the configuration: what is refused, and what is said instead."""
 
 import pytest
+from helpers import cases, refuses
 from omegaconf import OmegaConf
-from refusals import cases, refuses
 
 from torchrl_quad import load_drone
 from torchrl_quad.envs import TASKS

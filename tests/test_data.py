@@ -2,8 +2,7 @@
 
 import pytest
 import torch
-from refusals import cases, refuses
-from small_runs import assert_equal
+from helpers import assert_equal, cases, refuses
 from tensordict.nn import TensorDictModule
 from torchrl.envs import BatchSizeTransform, ExplorationType, PendulumEnv, StepCounter, TransformedEnv
 

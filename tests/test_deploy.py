@@ -11,7 +11,7 @@ import onnxruntime
 import pytest
 import torch
 from deploying import TASKS, build, by_hand, compiled, resting, run_c
-from refusals import refuses
+from helpers import refuses
 from torch import nn
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 

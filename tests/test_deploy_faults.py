@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import torch
 from deploying import FLOWN, build, measured, resting
-from refusals import cases, refuses
-from small_runs import run
+from helpers import cases, refuses, run
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.envs import PendulumEnv, RewardSum, TransformedEnv

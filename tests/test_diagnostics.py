@@ -6,7 +6,7 @@ import re
 
 import pytest
 import torch
-from refusals import cases, refuses
+from helpers import cases, refuses
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from test_bounded_steps import LOSSES

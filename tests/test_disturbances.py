@@ -2,8 +2,7 @@
 
 import pytest
 import torch
-from flying import fly, hold
-from refusals import cases, refuses
+from helpers import cases, fly, hold, refuses
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 

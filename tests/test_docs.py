@@ -11,8 +11,8 @@ from urllib.parse import unquote
 
 import pytest
 import yaml
+from helpers import ROOT, run
 from markdown_it import MarkdownIt
-from small_runs import ROOT, run
 from sphinx.util.inventory import InventoryFile
 from test_examples import EXAMPLES, reduced
 

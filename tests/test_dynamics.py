@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from flying import FLOWN
+from helpers import FLOWN
 from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 

@@ -4,7 +4,7 @@ import io
 
 import pytest
 import torch
-from flying import fly, hold, look_at_nothing, start
+from helpers import fly, hold, look_at_nothing, start
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, TransformedEnv, check_env_specs

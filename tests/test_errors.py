@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from refusals import cases, refuses
+from helpers import cases, refuses
 from tensordict import TensorDict, TensorDictParams
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn

@@ -5,8 +5,7 @@ import pickle
 
 import pytest
 import torch
-from flying import anew, pushed
-from refusals import refuses
+from helpers import anew, pushed, refuses
 from test_objectives import GAMMA, LAMBDA, REWARDS, doubling, make_abpt, make_networks, make_rollout, targets
 from torch.distributions import Normal
 from torchrl.modules import TanhNormal

@@ -4,7 +4,7 @@ import struct
 
 import numpy as np
 import pytest
-from refusals import cases, refuses
+from helpers import cases, refuses
 from scipy.spatial.transform import Rotation
 
 from torchrl_quad.deploy import frames

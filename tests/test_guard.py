@@ -2,8 +2,7 @@
 
 import pytest
 import torch
-from flying import FLOWN, anew, fly
-from refusals import cases, refuses
+from helpers import FLOWN, anew, cases, fly, refuses
 from tensordict import TensorDict
 
 from torchrl_quad import HoveringEnv, differentiable_rollout, load_drone, make_actor, make_env

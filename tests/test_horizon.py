@@ -4,8 +4,7 @@ import copy
 
 import pytest
 import torch
-from flying import Looks, anew, look_at_nothing, on_plain_tensors
-from refusals import cases, refuses
+from helpers import Looks, anew, cases, look_at_nothing, on_plain_tensors, refuses
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torch._dynamo.utils import counters

@@ -7,7 +7,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 import torch
-from refusals import cases, refuses
+from helpers import cases, refuses
 
 from torchrl_quad import HoveringEnv, load_drone
 from torchrl_quad.dynamics import import_drone

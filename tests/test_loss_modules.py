@@ -6,7 +6,7 @@ import textwrap
 
 import pytest
 import torch
-from refusals import cases, refuses
+from helpers import cases, refuses
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from test_objectives import GAMMA, make_networks, make_rollout
 from torch import nn

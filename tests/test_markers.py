@@ -7,8 +7,7 @@ import weakref
 import numpy as np
 import pytest
 import torch
-from flying import start
-from refusals import cases, refuses
+from helpers import cases, refuses, start
 from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv, check_env_specs
 from torchrl.record import CSVLogger, PixelRenderTransform, VideoRecorder

@@ -2,8 +2,7 @@
 
 import pytest
 import torch
-from flying import on_plain_tensors
-from refusals import cases, refuses
+from helpers import cases, on_plain_tensors, refuses
 from tensordict import TensorDict
 from torchrl.data import Unbounded
 from torchrl.envs import CatTensors, PendulumEnv, StepCounter, TransformedEnv, UnsqueezeTransform

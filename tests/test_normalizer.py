@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from refusals import refuses
+from helpers import refuses
 from tensordict.nn import TensorDictModule
 from test_transforms import check
 from torchrl.envs import TransformedEnv, VecNormV2, check_env_specs

@@ -8,10 +8,9 @@ import sys
 
 import gymnasium
 import pytest
+from helpers import SMALL, cases, refuses, rows
 from hydra.core.config_store import ConfigStore
 from own_task import CornerEnv
-from refusals import cases, refuses
-from small_runs import SMALL, rows
 from test_configuration import composed
 from test_docs import ROOT, files, importable  # noqa: F401, a fixture
 

@@ -9,8 +9,8 @@ import tomllib
 import zipfile
 
 import yaml
+from helpers import ROOT, run
 from packaging.specifiers import SpecifierSet
-from small_runs import ROOT, run
 
 PROGRAM = """
 import importlib.util, pathlib, torchrl_quad

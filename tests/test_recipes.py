@@ -8,10 +8,9 @@ import sys
 
 import pytest
 import torch
+from helpers import ROOT, cases, run
+from helpers import SMALL as SMALL_RUN
 from omegaconf import OmegaConf
-from refusals import cases
-from small_runs import ROOT, run
-from small_runs import SMALL as SMALL_RUN
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType
 from torchrl.objectives import SoftUpdate

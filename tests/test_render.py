@@ -7,10 +7,10 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
+from helpers import cases, refuses
 from matplotlib.figure import Figure
 from own_task import CornerEnv
 from PIL import Image
-from refusals import cases, refuses
 from torchrl.envs import RewardSum, TransformedEnv
 
 from torchrl_quad import ActionSequence, HoveringEnv, differentiable_rollout, envs, make_actor, make_env

@@ -10,9 +10,8 @@ import pytest
 import torch
 import yaml
 from deploying import contract_of
-from flying import fly, hold
+from helpers import cases, fly, hold, refuses
 from log_writers import END, TABLE, flight, ned, own_table, write_csv
-from refusals import cases, refuses
 
 import torchrl_quad
 from torchrl_quad import GeometricController, HoveringEnv, load_drone

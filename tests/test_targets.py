@@ -6,7 +6,7 @@ import subprocess
 import numpy as np
 import pytest
 from deploying import resting
-from refusals import cases, refuses
+from helpers import cases, refuses
 from scipy.spatial.transform import Rotation
 
 from torchrl_quad.deploy import autopilots, frames, load_bundle

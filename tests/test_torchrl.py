@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 import torch
-from refusals import cases, refuses
+from helpers import cases, refuses
 from tensordict import assert_close
 from test_bounded_steps import LOSSES
 from torch.nn.utils import parameters_to_vector

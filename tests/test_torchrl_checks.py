@@ -5,7 +5,7 @@ import copy
 
 import pytest
 import torch
-from refusals import refuses
+from helpers import refuses
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type

@@ -5,8 +5,7 @@ import math
 
 import pytest
 import torch
-from flying import anew
-from refusals import refuses
+from helpers import anew, refuses
 from torch.distributions import Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
 from torchrl.envs import Compose, EnvBase, ExplorationType, InitTracker, TransformedEnv, set_exploration_type

@@ -10,7 +10,7 @@ import pytest
 import torch
 import yaml
 
-pytest.register_assert_rewrite("browsing", "deploying", "flying", "log_writers", "small_runs")
+pytest.register_assert_rewrite("browsing", "deploying", "helpers", "log_writers")
 
 from browsing import browser, open_page  # noqa: E402, F401, fixtures
 from deploying import export_once, trace_once  # noqa: E402, F401, fixtures
@@ -139,7 +139,7 @@ def no_pictures(monkeypatch):
 @pytest.fixture
 def train(launch, no_pictures):
     """A small run without pictures; its checkpoint."""
-    from small_runs import SMALL
+    from helpers import SMALL
 
     from torchrl_quad.training.checkpoints import read_checkpoint
 

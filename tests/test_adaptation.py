@@ -5,9 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from helpers import SMALL, cases, refuses
 from log_writers import OURS, write_csv
-from refusals import cases, refuses
-from small_runs import SMALL
 
 from benchmarks import adaptation as benchmark
 from torchrl_quad import GeometricController, HoveringEnv, make_actor, make_visual_actor

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from refusals import refuses
+from helpers import refuses
 from rsl_rl.runners import OnPolicyRunner
 from skrl.agents.torch.ppo import PPO
 from skrl.memories.torch import RandomMemory

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from refusals import cases, refuses
+from helpers import cases, refuses
 
 from torchrl_quad.files import machine, read_rows
 

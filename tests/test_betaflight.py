@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from deploying import contract_of
-from refusals import cases, refuses
-from small_runs import ROOT
+from helpers import ROOT, cases, refuses
 
 from torchrl_quad.deploy import autopilots, frames, load_bundle
 from torchrl_quad.deploy.simulators import make_simulator

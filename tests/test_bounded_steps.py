@@ -4,14 +4,12 @@ import copy
 
 import pytest
 import torch
-from flying import anew, pushed
-from refusals import cases, refuses
+from helpers import anew, cases, pushed, refuses
 from tensordict import nn as of_td
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torch.distributions import Normal
-from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal
 
 from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_qvalue, make_value

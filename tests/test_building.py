@@ -5,9 +5,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from helpers import assert_equal, cases, refuses
 from omegaconf import OmegaConf
-from refusals import cases, refuses
-from small_runs import assert_equal
 from tensordict import TensorDict
 from torch import nn
 from torchrl.checkpoint import Checkpoint

@@ -9,15 +9,13 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from flying import start
 from gymnasium.utils.env_checker import check_env
+from helpers import cases, refuses, start
 from PIL import Image
-from refusals import cases, refuses
 from stable_baselines3 import PPO
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from torchrl.envs import DoubleToFloat, TransformedEnv
-from torchrl.envs.utils import check_env_specs
+from torchrl.envs import DoubleToFloat, TransformedEnv, check_env_specs
 
 from torchrl_quad import ActionSequence, DepthCamera, ForestEnv, HoveringEnv, LandingEnv, differentiable_rollout
 from torchrl_quad.adapters import DronesVecEnv

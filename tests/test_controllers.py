@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from refusals import refuses
+from helpers import refuses
 from scipy.linalg import solve_discrete_are
 from scipy.spatial.transform import Rotation
 from tensordict import TensorDict

@@ -2,11 +2,9 @@
 
 import pytest
 import torch
-from refusals import cases, refuses
-from small_runs import assert_equal
+from helpers import assert_equal, cases, refuses
 from tensordict.nn import TensorDictModule
-from torchrl.envs import BatchSizeTransform, PendulumEnv, StepCounter, TransformedEnv
-from torchrl.envs.utils import ExplorationType
+from torchrl.envs import BatchSizeTransform, ExplorationType, PendulumEnv, StepCounter, TransformedEnv
 
 from torchrl_quad import HoveringEnv, TrackingEnv, VisitedStateBuffer, differentiable_rollout, make_actor, restart
 from torchrl_quad.errors import UserValueError

@@ -11,10 +11,9 @@ import onnxruntime
 import pytest
 import torch
 from deploying import TASKS, build, by_hand, compiled, resting, run_c
-from refusals import refuses
+from helpers import refuses
 from torch import nn
-from torchrl.envs import TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 
 from torchrl_quad import HoveringEnv, files, load_drone, make_actor, make_visual_actor
 from torchrl_quad.deploy import StaleState, contract, export_policy, load_bundle

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import torch
 from deploying import FLOWN, build, measured, resting
-from refusals import cases, refuses
-from small_runs import run
+from helpers import cases, refuses, run
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.envs import PendulumEnv, RewardSum, TransformedEnv
@@ -276,11 +275,7 @@ sys.meta_path.insert(0, Blocked())
 """
 
 
-def python(program):
-    return run(sys.executable, "-c", program)
-
-
-def test_flying_needs_numpy_onnxruntime_and_jsonschema_alone(export_once):
+def test_flying_needs_numpy_onnxruntime_and_jsonschema_alone(export_once, monkeypatch):
     folder = export_once("hovering")[2]
     fly = f"""
 import numpy
@@ -289,19 +284,12 @@ bundle = load_bundle({str(folder)!r})
 print(bundle.check(), bundle({resting()}), frames.px4().to({{"position": [1, 2, 3]}}))
 assert "torch" not in sys.modules
 """
-    assert "array" in python(BLOCKED + fly)
-    missing = """
-sys.modules[{!r}] = None
-from torchrl_quad.deploy import load_bundle
-from torchrl_quad.errors import MissingPackage
-try:
-    load_bundle({!r})
-except MissingPackage as error:
-    print(error)
-"""
+    assert "array" in run(sys.executable, "-c", BLOCKED + fly)
     for name, why in {"onnxruntime": "flies", "jsonschema": "is checked"}.items():
-        said = python(BLOCKED + missing.format(name, str(folder)))
-        assert said.startswith(f"A bundle {why} with {name}: pip install {name} (import of {name} halted")
+        with monkeypatch.context() as patch:
+            patch.setitem(sys.modules, name, None)
+            said = f"^A bundle {why} with {name}: pip install {name} .import of {name} halted"
+            refuses(said, load_bundle, folder, error=ImportError)
 
 
 def test_the_package_imports_its_parts_when_they_are_asked_for():
@@ -310,7 +298,6 @@ def test_the_package_imports_its_parts_when_they_are_asked_for():
     for name in torchrl_quad.__all__:
         assert getattr(torchrl_quad, name).__module__.startswith("torchrl_quad"), name
     assert not hasattr(torchrl_quad, "Nothing") and not hasattr(torchrl_quad.deploy, "Nothing")
-    python("import sys, torchrl_quad; assert 'torch' not in sys.modules")
 
 
 def test_the_recipe_exports_the_best_policy_with_results_and_a_page(

@@ -11,10 +11,9 @@ import onnx
 import pytest
 import torch
 from deploying import build, compiled, pilot, resting
+from helpers import ROOT, refuses
 from onnx import TensorProto, helper
 from own_task import CornerEnv, RelayEnv
-from refusals import refuses
-from small_runs import ROOT
 from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import set_recurrent_mode

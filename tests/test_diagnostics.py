@@ -6,7 +6,7 @@ import re
 
 import pytest
 import torch
-from refusals import cases, refuses
+from helpers import cases, refuses
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from test_bounded_steps import LOSSES
@@ -14,10 +14,9 @@ from test_loss_modules import pendulum_networks
 from torch import nn
 from torchrl.envs import PendulumEnv
 
-from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_env
+from torchrl_quad import ABPTLoss, BPTTLoss, HoveringEnv, SHACLoss, differentiable_rollout, make_actor, make_env
 from torchrl_quad.diagnostics import audit_reward, compare_gradients, gradient_by_horizon, gradient_statistics
 from torchrl_quad.envs.terms import distance
-from torchrl_quad.objectives import ABPTLoss, BPTTLoss, SHACLoss
 
 
 class Weigh(nn.Module):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from refusals import cases, refuses
+from helpers import cases, refuses
 
 from torchrl_quad import GeometricController, HoveringEnv, QuadrotorParams, available_drones, load_drone, suggest_gains
 from torchrl_quad.dynamics import FlightController, presets

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from flying import FLOWN
+from helpers import FLOWN
 from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 
@@ -256,7 +256,11 @@ def setpoints(controller, n, size):
 
 
 @each_drone
-def test_thrust_roll_and_pitch_are_exact_where_yaw_alone_saturates(controller):
+def test_the_mixer_is_exact_to_the_last_bit_or_gives_up_yaw_first_and_asks_no_more_of_a_rotor_than_it_can(controller):
+    setpoint = setpoints(controller, 500, 0.02)
+    plain = matvec(controller.mixer, asked_wrench(controller, setpoint))
+    assert ((plain >= controller.thrust_min) & (plain <= controller.thrust_max)).all()
+    assert torch.equal(speeds(controller, setpoint), controller.rotors.speed(plain))
     setpoint = setpoints(controller, 500, 0.1)
     setpoint.body_rate[:, 2] = 1e3 * controller.nominal.max_body_rate[2]
     asked, flown = asked_wrench(controller, setpoint), controller.rotors.wrench(speeds(controller, setpoint))
@@ -269,18 +273,6 @@ def test_thrust_roll_and_pitch_are_exact_where_yaw_alone_saturates(controller):
     assert (error.abs() < 2e-6 * controller.thrust_max.max()).all()
     assert (flown[:, 3] > -1e-9).all() and (flown[feasible, 3] < asked[feasible, 3]).all()
     assert flown[feasible, 3].mean() > 0
-
-
-@each_drone
-def test_where_nothing_saturates_the_mixer_is_untouched_to_the_last_bit(controller):
-    setpoint = setpoints(controller, 500, 0.02)
-    plain = matvec(controller.mixer, asked_wrench(controller, setpoint))
-    assert ((plain >= controller.thrust_min) & (plain <= controller.thrust_max)).all()
-    assert torch.equal(speeds(controller, setpoint), controller.rotors.speed(plain))
-
-
-@each_drone
-def test_no_command_asks_more_of_a_rotor_than_it_can_give(controller):
     thrust = controller.rotors.thrust(speeds(controller, setpoints(controller, 500, 30.0)))
     slack = 1e-6 * controller.thrust_max
     assert ((thrust >= controller.thrust_min - slack) & (thrust <= controller.thrust_max + slack)).all()

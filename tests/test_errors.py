@@ -2,18 +2,17 @@
 
 import pytest
 import torch
-from refusals import cases, refuses
+from helpers import cases, refuses
 from tensordict import TensorDict, TensorDictParams
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.envs import MultiAction, StepCounter, TransformedEnv
 from torchrl.envs.transforms import Compose, ExcludeTransform, ObservationNorm, SelectTransform
 
-from torchrl_quad import HoveringEnv, HybridLoss, LandingEnv, SHACLoss, load_drone, make_env
+from torchrl_quad import HoveringEnv, HybridLoss, LandingEnv, SHACLoss, load_drone, make_actor, make_env, make_value
 from torchrl_quad.data import differentiable_rollout, restart
 from torchrl_quad.envs import Event
 from torchrl_quad.envs.disturbances import Disturbance
-from torchrl_quad.modules import make_actor, make_value
 from torchrl_quad.objectives.calls import holding
 from torchrl_quad.training.launch import Refused, _explained
 

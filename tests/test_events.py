@@ -4,8 +4,7 @@ import math
 
 import pytest
 import torch
-from flying import fly
-from refusals import cases
+from helpers import cases, fly
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 

@@ -5,15 +5,13 @@ import pickle
 
 import pytest
 import torch
-from flying import anew, pushed
-from refusals import refuses
+from helpers import anew, pushed, refuses
 from test_objectives import GAMMA, LAMBDA, REWARDS, doubling, make_abpt, make_networks, make_rollout, targets
 from torch.distributions import Normal
 from torchrl.modules import TanhNormal
 from torchrl.objectives import ValueEstimators
 
-from torchrl_quad import ActionSequence, HoveringEnv, differentiable_rollout
-from torchrl_quad.modules import make_actor, make_qvalue, make_value
+from torchrl_quad import ActionSequence, HoveringEnv, differentiable_rollout, make_actor, make_qvalue, make_value
 from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, PODSLoss, SAPOLoss, SHACLoss
 from torchrl_quad.objectives.calls import plain_of
 

@@ -7,7 +7,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from refusals import refuses
+from helpers import refuses
 
 from torchrl_quad import files
 from torchrl_quad.files import add_rows, locked, make_folder, read_rows, replacing, replacing_folder, write_rows

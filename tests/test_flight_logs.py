@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import cases, refuses
 from log_writers import END, OURS, TABLE, G, flight, own_table, write_csv
-from refusals import cases, refuses
 
 from torchrl_quad.errors import UserError
 from torchrl_quad.identification import LAYOUTS, Columns, LogError, MissingColumns, NoFlight, read_log

@@ -14,8 +14,7 @@ import torch
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.utils.env_checker import check_env, data_equivalence, data_shares_objects
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from refusals import refuses
-from small_runs import run
+from helpers import refuses, run
 from torchrl import envs as torchrl_envs
 
 import torchrl_quad

@@ -4,13 +4,11 @@ import copy
 
 import pytest
 import torch
-from flying import Looks, anew, look_at_nothing, on_plain_tensors
-from refusals import cases, refuses
+from helpers import Looks, anew, cases, look_at_nothing, on_plain_tensors, refuses
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torch._dynamo.utils import counters
-from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
 from torchrl_quad import ActionSequence, BPTTLoss, HoveringEnv, RacingEnv, audit_reward, differentiable_rollout
 from torchrl_quad.dynamics import DYNAMICS, PointMass

@@ -8,10 +8,9 @@ import re
 import numpy as np
 import pytest
 import torch
+from helpers import ROOT, refuses
 from log_writers import END, OURS, TABLE, G, flight, matrix, own_table, write_csv
-from refusals import refuses
 from scipy.spatial.transform import Rotation
-from small_runs import ROOT
 
 from benchmarks import identification as benchmark
 from torchrl_quad import HoveringEnv, load_drone

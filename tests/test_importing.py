@@ -2,15 +2,12 @@
 
 import json
 import re
-import runpy
-import sys
 from contextlib import nullcontext
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from refusals import cases, refuses
+from helpers import cases, refuses
 
 from torchrl_quad import HoveringEnv, load_drone
 from torchrl_quad.dynamics import import_drone
@@ -374,8 +371,7 @@ def test_rotors_are_found_by_their_names_and_axes_and_what_follows_from_a_given_
     torch.testing.assert_close(2.0 * strong.rotor_speed_max, wanted.rotor_speed_max)  # by the file's thrust2weight
 
 
-def test_the_recipe_writes_a_drone_from_a_model_and_what_it_includes(tmp_path, monkeypatch, capsys):
-    script = Path(__file__).parents[1] / "recipes/import_drone.py"
+def test_the_recipe_writes_a_drone_from_a_model_and_what_it_includes(launch, refused, tmp_path):
     include = "<include><uri>model://{}</uri></include>" + motors()
     (tmp_path / "x.sdf").write_text(sdf(include.format("frame")))
     (tmp_path / "tilted.sdf").write_text(sdf(FRAME + TILTING))
@@ -383,22 +379,14 @@ def test_the_recipe_writes_a_drone_from_a_model_and_what_it_includes(tmp_path, m
     refuses("the joint 'tilt' turns the rotor 'rotor_0'", load_drone, tmp_path / "y.sdf")
     slowed = FRAME.replace("<inertial>", "<velocity_decay><linear>1</linear></velocity_decay><inertial>", 1)
     (tmp_path / "frame.sdf").write_text(sdf(slowed))
-    monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "x.sdf"), "mass=3", f"output={tmp_path}/o/x.yaml"])
-    runpy.run_path(str(script), run_name="__main__")
-    assert "# Not read: velocity_decay/linear." in (tmp_path / "o/x.yaml").read_text()
-    assert load_drone(tmp_path / "o/x.yaml").mass == 3.0 and f"env.drone={tmp_path}/o/x.yaml" in capsys.readouterr().out
-    for output, said in (("x.urdf", "its name must end in .yaml"), (f"{tmp_path}/o/x.yaml", "says something else")):
-        monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "x.sdf"), "mass=4", f"output={output}"])
-        with pytest.raises(SystemExit):
-            runpy.run_path(str(script), run_name="__main__")
-        assert said in capsys.readouterr().err
-    monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "frame.sdf")])
-    with pytest.raises(SystemExit):
-        runpy.run_path(str(script), run_name="__main__")
-    advice = re.search(r"load_drone\(.*\)(?=, or)", capsys.readouterr().err)[0]
+    path = tmp_path / "o/x.yaml"
+    assert f"env.drone={path}" in launch("import_drone", tmp_path / "x.sdf", "mass=3", f"output={path}")
+    assert "# Not read: velocity_decay/linear." in path.read_text() and load_drone(path).mass == 3.0
+    for output, said in (("x.urdf", "its name must end in .yaml"), (path, "says something else")):
+        assert said in refused("import_drone", tmp_path / "x.sdf", "mass=4", f"output={output}")
+    advice = re.search(r"load_drone\(.*\)(?=, or)", refused("import_drone", tmp_path / "frame.sdf"))[0]
     with pytest.warns(DroneWarning, match="not read: velocity_decay/linear"):
         assert HoveringEnv(num_envs=1, drone=eval(advice)).nominal.mass.item() == 2.0
     (tmp_path / "x.toml").write_text(TOML)
-    with pytest.raises(ValueError, match="entry='b', linear_drag=") as refused:
-        load_drone(tmp_path / "x.toml", entry="b")
-    assert eval(re.search(r"load_drone\(.*\)(?=, or)", str(refused.value))[0]).mass.item() == pytest.approx(0.03)
+    said = refuses("entry='b', linear_drag=", load_drone, tmp_path / "x.toml", entry="b")
+    assert eval(re.search(r"load_drone\(.*\)(?=, or)", said)[0]).mass.item() == pytest.approx(0.03)

@@ -7,7 +7,7 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from refusals import refuses
+from helpers import refuses
 from tensordict import TensorDict
 from torch import nn
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers import refuses
 from log_writers import END, TABLE, flight, matrix, ned, own_table, write_csv
-from refusals import refuses
 from scipy.spatial.transform import Rotation
 
 from torchrl_quad.identification import Columns, LogError, read_log

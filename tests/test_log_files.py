@@ -15,7 +15,7 @@ import pytest
 from log_writers import END, SERVOS, TABLE, ULOG, dataflash_messages, flight, own_table, px4_messages, times
 
 from log_writers import ulog_message, usd_events, write_bag, write_csv, write_dataflash, write_ulog, write_usd  # isort: skip
-from refusals import refuses
+from helpers import refuses
 
 from torchrl_quad.identification import Columns, GapsTooLarge, LogError, MissingColumns, read_log, sources
 from torchrl_quad.identification.autopilots import PACKED, read_ulog, unpacked

@@ -9,9 +9,8 @@ from collections import Counter
 import pytest
 import yaml
 from conftest import RECIPES
+from helpers import EVERYTHING, SMALL, assert_equal, cases, poison, rows, stop_at_save
 from omegaconf import OmegaConf
-from refusals import cases
-from small_runs import EVERYTHING, SMALL, assert_equal, poison, rows, stop_at_save
 from torchrl import torchrl_logger
 
 from torchrl_quad.files import read_rows

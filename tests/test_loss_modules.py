@@ -6,7 +6,7 @@ import textwrap
 
 import pytest
 import torch
-from refusals import cases, refuses
+from helpers import cases, refuses
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from test_objectives import GAMMA, make_networks, make_rollout
 from torch import nn
@@ -351,22 +351,19 @@ class Doubled(nn.Module):
         return 2.0 * self.network(*inputs)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda critic: critic.register_forward_hook(lambda *arguments: None),
-        lambda critic: critic.module.mlp[3].register_full_backward_hook(lambda *arguments: None),
-        lambda critic: critic.module.mlp.__setitem__(2, nn.Dropout(0.5)),
-        lambda critic: critic.module.mlp.__setitem__(2, nn.PReLU()),
-        lambda critic: nn.utils.parametrizations.weight_norm(critic.module.mlp[0]),
-        lambda critic: critic.module.mlp.__setitem__(5, critic.module.mlp[2]),
-        lambda critic: setattr(critic.module, "head", nn.Softplus()),
-        lambda critic: setattr(critic, "module", Doubled(critic.module)),
-        lambda critic: setattr(critic, "__class__", type("Mine", (ValueOperator,), {})),
-    ],
+@cases(
+    (lambda critic: critic.register_forward_hook(lambda *arguments: None),),
+    (lambda critic: critic.module.mlp[3].register_full_backward_hook(lambda *arguments: None),),
+    (lambda critic: critic.module.mlp.__setitem__(2, nn.Dropout(0.5)),),
+    (lambda critic: critic.module.mlp.__setitem__(2, nn.PReLU()),),
+    (lambda critic: nn.utils.parametrizations.weight_norm(critic.module.mlp[0]),),
+    (lambda critic: critic.module.mlp.__setitem__(5, critic.module.mlp[2]),),
+    (lambda critic: setattr(critic.module, "head", nn.Softplus()),),
+    (lambda critic: setattr(critic, "module", Doubled(critic.module)),),
+    (lambda critic: setattr(critic, "__class__", type("Mine", (ValueOperator,), {})),),
     ids=["hook", "backward", "dropout", "parameters", "parametrization", "shared", "head", "module", "class"],
 )
-def test_a_critic_that_somebody_has_changed_is_called_as_it_is(env, change):
+def test_a_critic_that_somebody_has_changed_is_called_as_it_is(change, env):
     critic = make_value(env)
     change(critic)
     assert not hasattr(critic, "plain") or critic.plain() is None

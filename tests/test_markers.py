@@ -7,7 +7,7 @@ import weakref
 import numpy as np
 import pytest
 import torch
-from refusals import cases, refuses
+from helpers import cases, refuses, start
 from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv, check_env_specs
 from torchrl.record import CSVLogger, PixelRenderTransform, VideoRecorder
@@ -120,11 +120,6 @@ def test_figures_films_and_frames_show_everything_that_a_task_of_one_s_own_names
         assert (points >= limits[0] - 1e-5).all() and (points <= limits[1] + 1e-5).all()
 
 
-def recorded(env, **options):
-    """The environment under a recorder that keeps its film in memory."""
-    return TransformedEnv(env, Compose(PixelRenderTransform(**options), VideoRecorder(None, None)))
-
-
 @pytest.mark.parametrize("task", TASKS)
 def test_torchrl_records_videos_of_every_task(task, tmp_path):
     env = make_env(task, num_envs=3)
@@ -154,18 +149,11 @@ def test_the_flight_is_the_same_whether_it_is_rendered_or_not():
     assert torch.equal(fly(render=False), fly(render=True))
 
 
-def falls_first(env):
-    """The tensordict after a reset in which drone 0 is about to hit the ground."""
-    td = env.reset()
-    td["state", "position"][0, 2] = 0.05
-    td["state", "velocity"][0, 2] = -2.0
-    return env.reset(td, set_state=True)
-
-
 def test_after_a_partial_reset_one_drone_starts_again_and_the_others_fly_on():
     env = HoveringEnv(num_envs=2)
-    filmed = recorded(env)
-    rollout = filmed.rollout(3, tensordict=falls_first(filmed), auto_reset=False, break_when_any_done=False)
+    filmed = TransformedEnv(env, Compose(PixelRenderTransform(), VideoRecorder(None, None)))
+    falls_first = start(filmed, position=[(1.0, 0.0, 0.05), (1.0, 0.0, 1.5)], velocity=[(0, 0, -2), (0, 0, 0)])
+    rollout = filmed.rollout(3, tensordict=falls_first, auto_reset=False, break_when_any_done=False)
     (step,) = rollout["next", "terminated"][0, :, 0].nonzero().flatten().tolist()
     assert len(filmed.transform[1].obs) >= 5  # a start more
     frame = 3 + step  # two resets and the start come before the first step; this frame follows the crash
@@ -193,26 +181,13 @@ def test_a_frame_shows_the_state_after_the_last_step_or_rollout():
     flight["next", "reward"].sum().backward()
 
 
-class Witness(torch.autograd.Function):
-    """Does nothing, and lives as long as the graph that holds it."""
-
-    @staticmethod
-    def forward(ctx, x, witness):
-        ctx.witness = witness
-        return x.clone()
-
-    @staticmethod
-    def backward(ctx, grad):
-        return grad, None
-
-
 def test_no_graph_is_kept_for_pictures():
     env = HoveringEnv(num_envs=2, action_delay=0)
-    witness = torch.nn.Identity()
-    lives = weakref.ref(witness)
-    flight = env.step(env.reset().set("action", Witness.apply(torch.zeros(2, 4, requires_grad=True), witness)))
-    assert flight["next", "state", "position"].requires_grad
-    del witness
+    action = torch.zeros(2, 4, requires_grad=True)
+    lives = weakref.ref(action)
+    flight = env.step(env.reset().set("action", action))["next"]
+    assert flight["state", "position"].requires_grad
+    del action
     gc.collect()
     assert lives() is not None
     del flight

@@ -5,8 +5,7 @@ import math
 
 import pytest
 import torch
-from flying import FLOWN, fly
-from refusals import cases, refuses
+from helpers import FLOWN, cases, fly, refuses
 from scipy.spatial.transform import Rotation
 from torchrl.envs import check_env_specs
 

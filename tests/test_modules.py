@@ -2,15 +2,13 @@
 
 import pytest
 import torch
-from flying import on_plain_tensors
-from refusals import cases, refuses
+from helpers import cases, on_plain_tensors, refuses
 from tensordict import TensorDict
 from torchrl.data import Unbounded
 from torchrl.envs import CatTensors, PendulumEnv, StepCounter, TransformedEnv, UnsqueezeTransform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_quad import ABPTLoss, HoveringEnv, differentiable_rollout, load_drone
-from torchrl_quad.modules import make_actor, make_qvalue, make_value
+from torchrl_quad import ABPTLoss, HoveringEnv, differentiable_rollout, load_drone, make_actor, make_qvalue, make_value
 from torchrl_quad.objectives.calls import sample_action
 
 nan = float("nan")

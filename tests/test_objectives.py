@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from refusals import refuses
+from helpers import refuses
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn

@@ -3,47 +3,14 @@
 import importlib.metadata
 import os
 import shutil
-import subprocess
 import sys
 import tarfile
 import tomllib
 import zipfile
 
-import pytest
 import yaml
+from helpers import ROOT, run
 from packaging.specifiers import SpecifierSet
-from small_runs import ROOT, run
-
-
-@pytest.fixture(scope="module")
-def built(tmp_path_factory):
-    """The folder with the source distribution, and the wheel that was built from it."""
-    folder, source = tmp_path_factory.mktemp("wheel"), tmp_path_factory.mktemp("source")
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source)
-    for name in ("torchrl_quad", "recipes/config"):  # to which a link in the package leads
-        shutil.copytree(ROOT / name, source / name, symlinks=True)
-    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), str(source)]
-    subprocess.run(command, stdout=subprocess.DEVNULL, check=True)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def wheel(built):
-    return next(built.glob("*.whl"))
-
-
-def test_the_source_distribution_holds_every_file_and_the_wheel_package_presets_and_types_alone(built, wheel):
-    with tarfile.open(next(built.glob("*.tar.gz"))) as archive:
-        names = {name.partition("/")[2] for name in archive.getnames()}
-    ours = {str(p.relative_to(ROOT)) for p in (ROOT / "torchrl_quad").rglob("*") if p.suffix and p.is_file()}
-    assert {path for path in ours if "__pycache__" not in path} | {"README.md", "LICENSE", "pyproject.toml"} <= names
-    names = zipfile.ZipFile(wheel).namelist()
-    own = {str(path.relative_to(ROOT)) for path in (ROOT / "torchrl_quad").rglob("*.yaml")}
-    configuration = {path.relative_to(ROOT / "recipes") for path in (ROOT / "recipes/config").rglob("*.yaml")}
-    assert own | {f"torchrl_quad/training/{path}" for path in configuration} | {"torchrl_quad/py.typed"} <= set(names)
-    assert {name.split("/")[0].split("-")[0] for name in names} == {"torchrl_quad"}
-
 
 PROGRAM = """
 import importlib.util, pathlib, torchrl_quad
@@ -63,13 +30,30 @@ main()
 """
 
 
-def test_the_wheel_works_away_from_the_repository_and_so_does_a_recipe_of_your_own(wheel, tmp_path):
-    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(tmp_path / "site")]
-    subprocess.run([*pip, str(wheel)], check=True)
-    (tmp_path / "smooth.py").write_text(PROGRAM)
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
+def test_the_distributions_hold_every_file_and_the_wheel_works_away_from_the_repository(tmp_path):
+    """The source distribution, and the wheel that is built from it, with the package, presets and types alone."""
+    source = tmp_path / "source"
+    source.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    for name in ("torchrl_quad", "recipes/config"):  # to which a link in the package leads
+        shutil.copytree(ROOT / name, source / name, symlinks=True)
+    run(sys.executable, "-m", "build", "--no-isolation", "--outdir", str(tmp_path), str(source))
+    with tarfile.open(next(tmp_path.glob("*.tar.gz"))) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    ours = {str(p.relative_to(ROOT)) for p in (ROOT / "torchrl_quad").rglob("*") if p.suffix and p.is_file()}
+    assert {path for path in ours if "__pycache__" not in path} | {"README.md", "LICENSE", "pyproject.toml"} <= names
+    wheel = next(tmp_path.glob("*.whl"))
+    names = zipfile.ZipFile(wheel).namelist()
+    own = {str(path.relative_to(ROOT)) for path in (ROOT / "torchrl_quad").rglob("*.yaml")}
+    configuration = {path.relative_to(ROOT / "recipes") for path in (ROOT / "recipes/config").rglob("*.yaml")}
+    assert own | {f"torchrl_quad/training/{path}" for path in configuration} | {"torchrl_quad/py.typed"} <= set(names)
+    assert {name.split("/")[0].split("-")[0] for name in names} == {"torchrl_quad"}
+    site = str(tmp_path / "site")
+    run(sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", site, str(wheel))
+    (tmp_path / "smooth.py").write_text(PROGRAM)  # a recipe of one's own
     command = [sys.executable, "smooth.py", "--cfg", "job", "task=racing"]  # which shows the configuration
-    shown = yaml.safe_load(run(*command, cwd=tmp_path, env=environment))
+    shown = yaml.safe_load(run(*command, cwd=tmp_path, env={**os.environ, "PYTHONPATH": site}))
     assert (shown["algorithm"], shown["loss"]["smoothness"]) == ("smooth", 0.1)
     assert shown["env"]["max_episode_steps"] == 512
     assert shown["eval"]["interval"] == 20  # of racing in by_task/bptt.yaml

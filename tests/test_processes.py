@@ -13,7 +13,7 @@ from contextlib import redirect_stdout
 import pytest
 import torch
 import torch.distributed as dist
-from small_runs import EVERYTHING, ROOT, SMALL, assert_equal
+from helpers import EVERYTHING, ROOT, SMALL, assert_equal
 
 from torchrl_quad.training import drawing
 from torchrl_quad.training.checkpoints import read_checkpoint

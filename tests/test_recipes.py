@@ -8,9 +8,9 @@ import sys
 
 import pytest
 import torch
+from helpers import ROOT, cases, run
+from helpers import SMALL as SMALL_RUN
 from omegaconf import OmegaConf
-from small_runs import ROOT, run
-from small_runs import SMALL as SMALL_RUN
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType
 from torchrl.objectives import SoftUpdate
@@ -206,12 +206,9 @@ def test_abpt_lands_tracks_and_flies_two_laps(task, tmp_path):
     assert task != "tracking" or found["tracking_rmse"] < 0.05
 
 
-@pytest.mark.parametrize(
-    ("pattern", "lines", "had"),
-    [
-        (r"(?m)^(step|epochs):.*\n", "", "no step, no epochs"),
-        ("(?m)^actor:\n", "older: 1\nactor:\n  gone: 0.5\n  off: 0.0\n", "older, actor.gone"),
-    ],
+@cases(
+    (r"(?m)^(step|epochs):.*\n", "", "no step, no epochs"),
+    ("(?m)^actor:\n", "older: 1\nactor:\n  gone: 0.5\n  off: 0.0\n", "older, actor.gone"),
 )
 def test_what_an_older_recipe_wrote_can_be_flown_but_not_continued(
     pattern, lines, had, train, launch, refused, no_pictures, tmp_path

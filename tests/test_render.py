@@ -7,9 +7,10 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
+from helpers import cases, refuses
 from matplotlib.figure import Figure
+from own_task import CornerEnv
 from PIL import Image
-from refusals import cases, refuses
 from torchrl.envs import RewardSum, TransformedEnv
 
 from torchrl_quad import ActionSequence, HoveringEnv, differentiable_rollout, envs, make_actor, make_env
@@ -20,37 +21,20 @@ from torchrl_quad.render.video import View
 TASKS = ["hovering", "landing", "racing", "tracking"]
 
 
-class Climbing(HoveringEnv):
+class Plain(CornerEnv):
     """A user's task, without target and metrics."""
 
-    weights = {"climb": 1.0}
-
-    def initial_state(self, n):
-        return self.hover_state(self.uniform(n, 3) + self.tensor([0.0, 0.0, 2.0]))
-
-    def observe(self, state):
-        return state["position"]
-
-    def reward_terms(self, state):
-        return {"climb": self.weights["climb"] * state["velocity"][:, 2:]}
-
-    def is_crash(self, state):
-        return state["position"][:, 2:] <= 0
-
-    def is_success(self, state):
-        return state["position"][:, 2:] > 4
+    metric_info = EPISODE_METRICS
 
     def metrics(self, state):
         return {}
 
 
-class Measured(Climbing):
-    """The same with a metric, and described."""
+class Measured(CornerEnv):
+    """The same with a metric, which is its reward, too."""
 
-    metric_info = {**EPISODE_METRICS, "vertical_speed": Metric("climb rate", "cm/s", 100.0)}
-
-    def metrics(self, state):
-        return {"vertical_speed": state["velocity"][:, 2:]}
+    weights = {"distance": -1.0}
+    metric_info = {**EPISODE_METRICS, "corner_error": Metric("distance to the corner", "cm", 100.0)}
 
 
 class Wandering(HoveringEnv):
@@ -189,7 +173,7 @@ def test_positions_that_are_not_finite_are_left_out_of_every_picture(value, dron
 
 @pytest.mark.parametrize("shape", [(1,), (2, 3)])
 def test_a_target_that_is_no_position_is_not_drawn(shape, tmp_path):
-    class Own(Climbing):
+    class Own(Plain):
         def initial_state(self, n):
             return super().initial_state(n) | {"target": torch.ones(n, *shape)}
 
@@ -204,7 +188,7 @@ def test_a_target_that_is_no_position_is_not_drawn(shape, tmp_path):
     assert (env.render() != before).any()
 
 
-@cases((Climbing, True, "reward"), (Measured, False, "vertical speed"), (Measured, True, "climb rate [cm/s]"))
+@cases((Plain, True, "reward"), (Measured, False, "corner error"), (Measured, True, "distance to the corner [cm]"))
 def test_a_task_without_targets_shows_its_metrics_or_its_reward(cls, given, name, tmp_path):
     env = cls(num_envs=2, max_episode_steps=20)
     flight = env.rollout(20, break_when_any_done=False)

@@ -7,8 +7,7 @@ from unittest.mock import Mock
 
 import imageio_ffmpeg
 import pytest
-from refusals import refuses
-from small_runs import SMALL
+from helpers import SMALL, refuses
 
 from torchrl_quad import HoveringEnv
 from torchrl_quad.render import animate_flight, plot_episode, plot_flight, video, write_replay

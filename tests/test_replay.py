@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from browsing import TIMEOUT
-from refusals import refuses
+from helpers import refuses
 from torchrl.envs import RewardSum, TransformedEnv
 
 from torchrl_quad import HoveringEnv, RacingEnv, differentiable_rollout, make_actor, make_env

@@ -12,7 +12,7 @@ import time
 import numpy as np
 import pytest
 import torch
-from refusals import cases, refuses
+from helpers import cases, refuses
 from scipy.stats import mannwhitneyu
 
 from benchmarks.paper import elsewhere, flights, gradients, matrix, reproduce, results, running, tables

@@ -20,9 +20,8 @@ from unittest.mock import Mock
 import pytest
 import torch
 import yaml
+from helpers import EVERYTHING, ROOT, SMALL, assert_equal, cases, refuses, rows, stop_at_save
 from omegaconf import OmegaConf
-from refusals import cases, refuses
-from small_runs import EVERYTHING, ROOT, SMALL, assert_equal, rows, stop_at_save
 
 from torchrl_quad import BPTTLoss
 from torchrl_quad.training import loop

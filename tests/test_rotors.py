@@ -10,13 +10,11 @@ import pytest
 import torch
 import yaml
 from deploying import contract_of
-from flying import fly, hold
+from helpers import cases, fly, hold, refuses
 from log_writers import END, TABLE, flight, ned, own_table, write_csv
-from refusals import cases, refuses
 
 import torchrl_quad
-from torchrl_quad import HoveringEnv, load_drone
-from torchrl_quad.controllers import GeometricController
+from torchrl_quad import GeometricController, HoveringEnv, load_drone
 from torchrl_quad.deploy import contract, frames
 from torchrl_quad.deploy.simulators import make_simulator, special
 from torchrl_quad.dynamics import FlightController, Quadrotor

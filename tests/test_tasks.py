@@ -4,8 +4,7 @@ import math
 
 import pytest
 import torch
-from flying import fly, hold, start
-from refusals import cases, refuses
+from helpers import cases, fly, hold, refuses, start
 from torchrl.envs import check_env_specs
 
 from torchrl_quad import LandingEnv, RacingEnv, TrackingEnv, load_track

@@ -1,11 +1,4 @@
-"""The environment in TorchRL's own hands: under its transforms, losses and collectors, and in several processes.
-
-The last section follows TorchRL's own tests (pytorch/rl, test/envs), and names them. These do not apply: environments
-that reset themselves (TestAutoReset), as ours do not, and refuse to be called so; sums of ("reward_terms", name), which
-RewardSum takes of the reward spec alone, while our terms are observations that a reset writes; nested done flags,
-several agents, strings, tensorclasses, dynamic specs and discrete actions, of which there are none; and a batch in
-AsyncEnvPool, which in TorchRL 0.14 does not fly its own CountingEnv(batch_size=[3]) either.
-"""
+"""The environment in TorchRL's own hands; the last section follows TorchRL's tests (pytorch/rl, test/envs) by name."""
 
 import multiprocessing
 import pickle
@@ -14,7 +7,7 @@ from functools import partial
 
 import pytest
 import torch
-from refusals import cases, refuses
+from helpers import cases, refuses
 from tensordict import assert_close
 from test_bounded_steps import LOSSES
 from torch.nn.utils import parameters_to_vector
@@ -26,9 +19,8 @@ from torchrl.envs.transforms import Compose, RewardSum, StepCounter, Transformed
 from torchrl.envs.utils import step_mdp
 from torchrl.objectives import SoftUpdate
 
-from torchrl_quad import HoveringEnv, ObservationNormalizer, VisitedStateBuffer, differentiable_rollout
+from torchrl_quad import HoveringEnv, ObservationNormalizer, VisitedStateBuffer, differentiable_rollout, make_actor
 from torchrl_quad.envs import TASKS, make_env
-from torchrl_quad.modules import make_actor
 from torchrl_quad.objectives import BPTTLoss
 
 FEATURES = ["observation", ("state", "velocity")]

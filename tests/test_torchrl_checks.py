@@ -1,26 +1,18 @@
-"""TorchRL's own checks of losses, for each of ours; the sentence under a test names the one that it follows.
-
-They are in pytorch/rl, test/objectives: ``_objectives_common.py`` (common), ``test_loss_module.py`` (module) and
-``test_sac.py`` (sac). Masks, keys and checkpoints have tests in ``test_loss_modules.py``, too.
-What does not apply: prioritised weights, multi-step targets and ``skip_done_states`` belong to replayed samples, and
-these losses differentiate a rollout; composite and discrete distributions have no derivative of single actions;
-``separate_losses``, ``delay_actor`` and ``action_spec`` are options of others. Value estimators are chosen by name, not
-given, since their numbers take the precision of the actor; GAE and V-trace are refused (``test_objectives.py``).
-"""
+"""TorchRL's own checks of losses, for each of ours: those of pytorch/rl, test/objectives, which each test names, in
+``_objectives_common.py`` (common), ``test_loss_module.py`` (module) and ``test_sac.py`` (sac)."""
 
 import copy
 
 import pytest
 import torch
-from refusals import refuses
+from helpers import refuses
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 from torchrl.modules import ActorValueOperator, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import HardUpdate, SoftUpdate
 
-from torchrl_quad import HoveringEnv, differentiable_rollout
-from torchrl_quad.modules import make_actor, make_qvalue, make_value
+from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_qvalue, make_value
 from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss
 
 CRITICS = {"shac": SHACLoss, "sapo": SAPOLoss, "ahac": AHACLoss, "hybrid": HybridLoss, "abpt": ABPTLoss}

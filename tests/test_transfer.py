@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 from deploying import pilot
-from refusals import cases, refuses
-from small_runs import run
+from helpers import cases, refuses, run
 
 from torchrl_quad import HoveringEnv, load_drone, make_env
 from torchrl_quad.deploy import describe, load_bundle

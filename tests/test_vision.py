@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from refusals import cases, refuses
+from helpers import cases, refuses
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.vision import DepthCamera, Primitives, closest_approach, nearest

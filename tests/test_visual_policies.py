@@ -5,12 +5,10 @@ import math
 
 import pytest
 import torch
-from flying import anew
-from refusals import refuses
+from helpers import anew, refuses
 from torch.distributions import Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
-from torchrl.envs import Compose, EnvBase, InitTracker, TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs import Compose, EnvBase, ExplorationType, InitTracker, TransformedEnv, set_exploration_type
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 

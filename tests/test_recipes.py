@@ -136,6 +136,9 @@ def test_an_evaluation_of_more_episodes_than_drones_flies_rounds_from_starts_of_
     terms = [value for name, value in metrics.items() if name.startswith("reward/")]
     assert sum(terms) == pytest.approx(sum(means) / 3, rel=1e-5)
     torch.testing.assert_close(flight["state"].to_dict(), rounds[-1][1]["state"].to_dict(), rtol=0, atol=0)
+    own = {"episode_metrics": lambda _, flight: {"height": flight["next", "state", "position"][:, -1, 2:]}}
+    with pytest.raises(ValueError, match=r"Own.episode_metrics: 'height' must have .* shape \(4,\); got \(4, 1\)"):
+        evaluate(type("Own", (LandingEnv,), own)(num_envs=4, max_episode_steps=10), actor)
 
 
 def judged(actor, seed=99, **options):

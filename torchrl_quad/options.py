@@ -8,12 +8,15 @@ as a tensor or a network, the function checks itself.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import functools
 import importlib
 import inspect
+import pkgutil
 import re
+import sys
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -193,13 +196,23 @@ def imported(path: Any, what: str = "task") -> Any:
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise  # the module is there, and needs one that is not
-        mend = "Put its folder on PYTHONPATH, or install its package."
+        mend, parent = "Put its folder on PYTHONPATH, or install its package.", error.name.rpartition(".")[0]
+        if parent:  # which is there
+            names = [x.name for x in pkgutil.iter_modules(getattr(sys.modules[parent], "__path__", []))]
+            mend = f"{parent!r} has: {', '.join(names) or 'no modules'}."
         raise UserValueError(f"{what} {path!r}: Python finds no module {error.name!r}. {mend}") from None
+    said = f"the module {module!r} ({found.__file__}) has no {name!r}"
     if not hasattr(found, name):
-        own = [f"{module}.{x}" for x, y in vars(found).items() if isinstance(y, type) and y.__module__ == module]
-        mend = f" Write one of: {', '.join(own)}." if own else ""
-        raise UserValueError(f"{what} {path!r}: the module {module!r} ({found.__file__}) has no {name!r}.{mend}")
-    return getattr(found, name)
+        with contextlib.suppress(ModuleNotFoundError):  # the path may be that of a module
+            found, said = importlib.import_module(path), "this is a module"
+    elif not isinstance(end := getattr(found, name), types.ModuleType):
+        return end
+    else:
+        found, said = end, "this is a module"
+    module = found.__name__
+    own = [f"{module}.{x}" for x, y in vars(found).items() if isinstance(y, type) and y.__module__ == module]
+    mend = f" Write one of: {', '.join(own)}." if own else ""
+    raise UserValueError(f"{what} {path!r}: {said}.{mend}")
 
 
 def declared(target: Callable[..., Any]) -> dict[str, tuple[Any, str]]:

@@ -99,7 +99,7 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         scene: obstacles, which drones crash into: a mapping or a YAML file; see :class:`~torchrl_quad.Scene`.
         camera: adds ``"depth"`` (num_envs, 1, height, width) [m] to what a policy may read: a
             :class:`~torchrl_quad.DepthCamera`, or a mapping of its fields. Without a scene it shows the ground z = 0.
-        compile: compile the step and its first derivative: half a minute the first time; see ``docs/performance.md``.
+        compile: compile the step and its first derivative: a minute the first time; see ``docs/performance.md``.
 
     Raises:
         TypeError: an argument is unknown.

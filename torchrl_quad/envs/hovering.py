@@ -7,7 +7,7 @@ from torch import Tensor
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.markers import Markers
-from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, first_episode, read
+from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, at_episode_end, read
 from torchrl_quad.envs.terms import BODY_BOUNDS, TARGET_WEIGHTS, body_observation, distance, outside, target_reward
 
 
@@ -71,11 +71,7 @@ class HoveringEnv(QuadrotorEnv):
         """Takes ``position_error`` as the mean over the last second of the episode [m], by which it is solved, unless a
         subclass has an ``is_success`` of its own."""
         metrics = super().episode_metrics(rollout)
-        first = first_episode(rollout)
-        steps_left = first.sum(1, keepdim=True) - first.cumsum(1)
-        last_second = first & (steps_left < round(1 / self.control_dt))
-        error = read(rollout, "metrics", "position_error")
-        error = ((error * last_second).sum(1) / last_second.sum(1)).squeeze(-1)
+        error = at_episode_end(rollout, read(rollout, "metrics", "position_error"), steps=round(1 / self.control_dt))
         if type(self).is_success is HoveringEnv.is_success:
             metrics["solved"] = (error < self.success_radius) * (1 - metrics["crash"])
         return {**metrics, "position_error": error}

@@ -223,7 +223,7 @@ def check_task(env: Task, state: State) -> dict[Key, Disturbance]:
             kind_of = ", dtype=torch.bool" if dtype == torch.bool else ""
             hint = f" Write torch.full_like(state['position'][:, :1], {x}{kind_of})." if columns else ""
         elif columns and isinstance(x, Tensor) and x.shape[1:] != (1,):
-            hint = " Keep the last dimension: norm(x) of envs.terms, or .sum(-1, keepdim=True)."
+            hint = " Keep the last dimension: x[:, 2:3], not x[:, 2]; norm(x) of envs.terms; .sum(-1, keepdim=True)."
         hint = " Convert it: .to(self.dtype)." if is_right and dtype == env.dtype else hint
         check(is_right and dtype in (None, x.dtype), f"{method} must be a tensor {wanted}; got {_kind(x)}.{hint}")
         broken = f"{method} is not finite at the start. Look for a quotient, a root or a logarithm near zero."
@@ -237,7 +237,7 @@ def check_task(env: Task, state: State) -> dict[Key, Disturbance]:
         except KeyError as error:
             raise UserValueError(
                 f"{task}.{name} asks for {error}, which is no entry of the state or of weights. The state has: "
-                f"{', '.join(map(str, states[0]))}."
+                f"{', '.join(map(str, states[0]))}; the weights: {', '.join(env.weights) or 'nothing'}."
             ) from error
         for key, x, version in before:
             changes = f"{name} writes into {key!r} in place, which changes the flight itself."

@@ -44,6 +44,12 @@ def evaluate(
             )
             first = first_episode(flight)
             measured = {f"eval/{name}": x for name, x in task.episode_metrics(flight).items()}
+            for name in (name for name, x in measured.items() if x.shape != flight.shape[:1]):
+                raise UserValueError(
+                    f"{type(task).__name__}.episode_metrics: {name[5:]!r} must have one value for each episode, shape "
+                    f"{tuple(flight.shape[:1])}; got {tuple(measured[name].shape)}. Take the last step of the episode "
+                    "by envs.metrics.at_episode_end(rollout, x), or write x.flatten()."
+                )
             for name, term in group(flight, ("next", "reward_terms")).items():
                 measured[f"reward/{name}"] = cast("Tensor", (term * first).sum(1))
             of_episodes.append(measured)

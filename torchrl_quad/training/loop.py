@@ -154,7 +154,10 @@ class Run:
         began = time.perf_counter()
         if self.cfg.compile and self.goes_on:
             if rank() == 0:
-                print("Compiling the control step: about 30 s, which the next run finds in a cache.", flush=True)
+                print(
+                    "Compiling the control step: about a minute. Later runs of this task find it in a cache.",
+                    flush=True,
+                )
             self._warm_up()
             if rank() == 0:
                 print(f"Compiled in {time.perf_counter() - began:.0f} s.", flush=True)
@@ -204,8 +207,9 @@ class Run:
                     self.starts.clear()
                     self._save(self.folder / "checkpoint.pt")
         if rank() == 0:
-            if self.levelled_off:
-                print(f"Stopped before total_steps: no evaluation has risen since step {last_rise(self.rows):,}.")
+            if self.cfg.eval.patience is not None:
+                how, rise = "Stopped before" if self.levelled_off else "Flew all of", f"{last_rise(self.rows):,}"
+                print(f"{how} total_steps: the last evaluation that rose by 1 % was that of step {rise}.")
             self._finish()
             print(f"{time.perf_counter() - began:.0f} s in all, {self.seconds:.0f} s of them training.")
 

@@ -261,8 +261,8 @@ def test_what_is_no_task_is_refused_when_it_is_registered(name, cls, error, mess
     ("own_task.norm", "a task is a subclass of QuadrotorEnv"),
     ("examples.tasks.flip", "'examples.tasks.flip': this is a module. Write one of: examples.tasks.flip.Flip"),
     ("torchrl_quad.envs.forest", "this is a module. Write one of: torchrl_quad.envs.forest.ForestEnv"),
-    ("examples.tasks.flop.Flip", "no module 'examples.tasks.flop'. 'examples.tasks' has: .*flip"),
-    ("own_task.corner.CornerEnv", "no module 'own_task.corner'. 'own_task' has: no modules"),
+    ("examples.tasks.flop.Flip", "'examples.tasks' has no 'flop'. Write the path of a class in one of .*: .*flip, "),
+    ("own_task.corner.CornerEnv", "the module 'own_task' .* has no 'corner'. Write one of: own_task.CornerEnv"),
 )
 def test_recipes_say_in_one_line_how_a_task_that_they_do_not_know_becomes_known(task, message, refused, tmp_path):
     assert re.search(message, refused("bptt", f"task={task}", f"hydra.run.dir={tmp_path}/run"))

@@ -282,6 +282,8 @@ def test_methods_are_compared_by_interquartile_means_and_by_who_beats_whom(tmp_p
     curves = [run | {"seed": s, "seconds": 10 * i, "return": x} for s, of in ends.items() for i, x in enumerate(of, 1)]
     (choice,) = tables.choice_table(rows, none, curves)
     assert choice.popitem() == ("One setting at 98 % of the best tuned", "20 s, 3 of 4 seeds")
+    alone = [row | {"algorithm": "train"} for row in rows if row["algorithm"] == "ppo"]
+    assert tables.choice_table(alone, none, curves)[0].popitem()[0] == "level with it"
     (level,) = tables.choice_table([x for x in rows if x["algorithm"] != "ppo"], none)
     assert list(level.values())[2:] == ["BPTT: 9.1, 98.0%, 3 s, 3 seeds", "SHAC"]
     speeds = {"BPTT": "333", "SHAC": "200", "ABPT": "1000", "PPO": "25"}

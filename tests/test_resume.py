@@ -129,7 +129,7 @@ def test_a_run_ends_when_its_evaluation_has_levelled_off_says_so_and_goes_on_wit
     monkeypatch.setattr(loop, "evaluate", lambda *_: ({"eval/return": 1.0, "eval/solved": 1.0}, None))
     options = [*SMALL, "horizon=2", "eval.interval=1", "total_steps=480", f"hydra.run.dir={tmp_path}", "resume=auto"]
     said = launch("bptt", *options, "eval.patience=0.5")
-    assert "Stopped before total_steps: the last evaluation that rose by 1 % was that of step 8.\n" in said
+    assert "Stopped before total_steps, since the last evaluation that improved by 1 % was at step 8.\n" in said
     assert read_checkpoint(tmp_path / "checkpoint.pt")["iteration"] == len(rows(tmp_path)) == 22
     assert launch("bptt", *options) == f"Finished before: {tmp_path}\n"
     assert "Stopped" not in launch("bptt", *options, "eval.patience=null")

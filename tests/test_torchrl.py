@@ -1,4 +1,8 @@
-"""The environment in TorchRL's own hands; the last section follows TorchRL's tests (pytorch/rl, test/envs) by name."""
+"""The environment in TorchRL's own hands; the last section follows TorchRL's tests (pytorch/rl, test/envs) by name.
+
+These do not apply: TestAutoReset, as our environments do not reset themselves; RewardSum of ("reward_terms", name),
+which are observations here; nested done flags, several agents, strings, tensorclasses, dynamic specs, discrete actions.
+"""
 
 import multiprocessing
 import pickle

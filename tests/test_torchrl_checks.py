@@ -1,5 +1,9 @@
 """TorchRL's own checks of losses, for each of ours: those of pytorch/rl, test/objectives, which each test names, in
-``_objectives_common.py`` (common), ``test_loss_module.py`` (module) and ``test_sac.py`` (sac)."""
+``_objectives_common.py`` (common), ``test_loss_module.py`` (module) and ``test_sac.py`` (sac).
+
+What belongs to replayed samples does not apply, such as prioritised weights and multi-step targets, nor do composite
+and discrete distributions, which have no derivative of single actions. GAE and V-trace are refused.
+"""
 
 import copy
 

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from helpers import refuses
+from helpers import on_plain_tensors, refuses
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from tensordict.nn import TensorDictModule
@@ -11,7 +11,7 @@ from torchrl.envs import transforms as T
 
 from torchrl_quad import HoveringEnv, ObservationNormalizer, differentiable_rollout, make_actor, make_visual_actor
 from torchrl_quad.data import flight_mode
-from torchrl_quad.data.transforms import transforms_of, under_transforms
+from torchrl_quad.data.transforms import normalized, transforms_of, under_transforms
 from torchrl_quad.objectives.calls import action_gradient
 
 OBSERVATION = ["observation"]
@@ -255,6 +255,22 @@ def test_under_the_normalizer_errors_and_unwanted_outputs_stay_as_they_are():
         differentiable_rollout(env, make_actor(env), env.reset().exclude("observation"), 2)
     policy = TensorDictModule(lambda x: (x, x[:, :4].tanh()), in_keys=["observation"], out_keys=["_", "action"])
     assert differentiable_rollout(env, policy, None, 3)[0].shape == (4, 3)
+
+
+def test_a_normalized_policy_on_plain_tensors_is_the_policy_and_one_with_hooks_has_no_plain_form():
+    env = HoveringEnv(num_envs=4, dtype=torch.float64)
+    normalizer = ObservationNormalizer(env)
+    normalizer.update(env.rollout(20))
+    actor = make_actor(env, in_keys=[("state", "velocity"), "observation"], input_scale=(0.3, 0.7))
+    td = env.reset()
+    written, plain, drawn = on_plain_tensors(normalized(actor, normalizer), td, ExplorationType.DETERMINISTIC)
+    _, mine = plain.forward(plain.weights, [td[key] for key in plain.in_keys], drawn)
+    torch.testing.assert_close(mine["action"], written["action"])
+    expected, found = (torch.autograd.grad(x["action"].sum(), list(actor.parameters())) for x in (written, mine))
+    torch.testing.assert_close(found, expected)
+    assert torch.equal(written["observation"], td["observation"])
+    next(x for x in actor.modules() if isinstance(x, torch.nn.Linear)).register_forward_hook(lambda *_: None)
+    assert normalized(actor, normalizer).plain() is None
 
 
 @pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers with non-empty batch-size:UserWarning")

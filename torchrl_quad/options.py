@@ -8,7 +8,6 @@ as a tensor or a network, the function checks itself.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import difflib
 import functools
@@ -186,33 +185,36 @@ def imported(path: Any, what: str = "task") -> Any:
     """What a path leads to, such as "mypackage.WindowEnv"; its module is imported.
 
     Raises:
-        ValueError: it is no path, there is no such module, or that has nothing of this name.
+        ValueError: it is no path, or that of a module; or there is no such module, or that has nothing of this name.
     """
     if not (isinstance(path, str) and re.fullmatch(r"\w+(\.\w+)+", path)):
         raise UserValueError(f"{what}={shown(path)}: it must be the path of a class, such as mypackage.Mine.")
     module, _, name = path.rpartition(".")
     try:
         found = importlib.import_module(module)
+        end = getattr(found, name) if hasattr(found, name) else importlib.import_module(path)
     except ModuleNotFoundError as error:
-        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+        above, _, missing = (error.name or "").rpartition(".")
+        own = missing and f"{path}.".startswith(f"{error.name}.")
+        if not own or (above and above not in sys.modules):
             raise  # the module is there, and needs one that is not
-        mend, parent = "Put its folder on PYTHONPATH, or install its package.", error.name.rpartition(".")[0]
-        if parent:  # which is there
-            names = [x.name for x in pkgutil.iter_modules(getattr(sys.modules[parent], "__path__", []))]
-            mend = f"{parent!r} has: {', '.join(names) or 'no modules'}."
-        raise UserValueError(f"{what} {path!r}: Python finds no module {error.name!r}. {mend}") from None
-    said = f"the module {module!r} ({found.__file__}) has no {name!r}"
-    if not hasattr(found, name):
-        with contextlib.suppress(ModuleNotFoundError):  # the path may be that of a module
-            found, said = importlib.import_module(path), "this is a module"
-    elif not isinstance(end := getattr(found, name), types.ModuleType):
-        return end
-    else:
-        found, said = end, "this is a module"
-    module = found.__name__
-    own = [f"{module}.{x}" for x, y in vars(found).items() if isinstance(y, type) and y.__module__ == module]
-    mend = f" Write one of: {', '.join(own)}." if own else ""
-    raise UserValueError(f"{what} {path!r}: {said}.{mend}")
+        said = f"Python finds no module {missing!r}. Put its folder on PYTHONPATH, or install its package."
+        if found := sys.modules.get(above):
+            at = getattr(found, "__file__", None)
+            said = f"the module {above!r}{f' ({at})' if at else ''} has no {missing!r}. {_classes_in(found)}"
+        raise UserValueError(f"{what} {path!r}: {said}") from None
+    if isinstance(end, types.ModuleType):
+        raise UserValueError(f"{what} {path!r}: this is a module. {_classes_in(end)}")
+    return end
+
+
+def _classes_in(module: types.ModuleType) -> str:
+    """Which paths of classes in a module, or else in those below it, may be written."""
+    name = module.__name__
+    if own := [f"{name}.{x}" for x, y in vars(module).items() if isinstance(y, type) and y.__module__ == name]:
+        return f"Write one of: {', '.join(own)}."
+    below = [x.name for x in pkgutil.iter_modules(getattr(module, "__path__", []))]
+    return f"Write the path of a class{' in one of its modules: ' * bool(below)}{', '.join(below)}."
 
 
 def declared(target: Callable[..., Any]) -> dict[str, tuple[Any, str]]:

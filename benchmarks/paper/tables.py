@@ -246,8 +246,9 @@ def choice_table(rows: Sequence[Row], starts: Starts, curves: Sequence[Row] = ()
         said = {x: f"{flights.METHODS[x]}: {returns[x]:.4g}, {worst[x]:.1%}, {seconds_of[x]:.0f} s{few}" for x in tried}
         row = {"task": LABELS.get(task, task), "quickest that works with every seed": said.get(quick, "none")}
         row |= {"highest return": said[most], "level with it": ", ".join(level)}
-        goal = max(returns[x] for x in tried if x != "train")
-        if came := [until(own, goal - 0.02 * abs(goal)) for (of, _), own in untuned.items() if of == task]:
+        goal = max((returns[x] for x in tried if x != "train"), default=math.inf)
+        came = [until(own, goal - 0.02 * abs(goal)) for (of, _), own in untuned.items() if of == task]
+        if came and goal < math.inf:
             when = f"{np.median(came):.0f} s, " if np.median(came) < math.inf else ""
             row["One setting at 98 % of the best tuned"] = f"{when}{np.isfinite(came).sum()} of {seeds(len(came))}"
         lines.append(row)

@@ -78,9 +78,9 @@ def first_episode(rollout: TensorDictBase) -> Tensor:
 
 def at_episode_end(rollout: TensorDictBase, value: Tensor, steps: int = 1) -> Tensor:
     """A value (num_envs, time, 1) at the last step of the first episode of each environment, (num_envs); or its mean
-    over as many last steps of it."""
+    over the last ``steps`` of that episode."""
     first = first_episode(rollout)
     if steps == 1:
         return value.gather(1, first.sum(1, keepdim=True) - 1).flatten()
     last = first & (first.sum(1, keepdim=True) - first.cumsum(1) < steps)
-    return ((value * last).sum(1) / last.sum(1)).squeeze(-1)
+    return (value.where(last, 0).sum(1) / last.sum(1)).squeeze(-1)

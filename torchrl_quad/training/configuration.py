@@ -31,17 +31,17 @@ _PYTHON = re.compile(r"""('(?:\\.|[^'\\])*'|"(?:\\.|[^"\\])*")(\s*:)?|(?<![^\s,\
 
 
 def _steps_in(seconds: float, cfg: DictConfig) -> float:
-    """Control steps in a time of train.yaml; a period that is none gets its error from the schema."""
+    """Control steps in a time of train.yaml; the schema refuses a period that no environment takes."""
     period = OmegaConf.select(cfg, "env.control_dt", throw_on_resolution_failure=False)
-    return seconds / period if isinstance(period, float | int) and period > 0 else 1.0
+    return seconds / period if isinstance(period, float | int) and 1e-6 <= period <= 1.0 else 1.0
 
 
 def _resolve(name: str, of_steps: Callable[[float], float]) -> None:
-    """Offer ``${NAME:SECONDS}`` to configurations: a function of the control steps in the time."""
+    """Register ``${NAME:SECONDS}``, a function of the time in control steps."""
     OmegaConf.register_new_resolver(name, lambda seconds, *, _root_: of_steps(_steps_in(seconds, _root_)), replace=True)
 
 
-_resolve("steps_in", lambda steps: max(round(steps), 1))
+_resolve("steps_in", lambda steps: min(max(round(steps), 1), 100_000))  # the longest horizon of the schema
 _resolve("decay_over", lambda steps: max(1.0 - 1.0 / steps, 0.0))  # per control step, with this time constant
 
 

@@ -44,12 +44,14 @@ def evaluate(
             )
             first = first_episode(flight)
             measured = {f"eval/{name}": x for name, x in task.episode_metrics(flight).items()}
-            for name in (name for name, x in measured.items() if x.shape != flight.shape[:1]):
-                raise UserValueError(
-                    f"{type(task).__name__}.episode_metrics: {name[5:]!r} must have one value for each episode, shape "
-                    f"{tuple(flight.shape[:1])}; got {tuple(measured[name].shape)}. Take the last step of the episode "
-                    "by envs.metrics.at_episode_end(rollout, x), or write x.flatten()."
-                )
+            for name, x in measured.items():
+                if not isinstance(x, Tensor) or x.shape != flight.shape[:1]:
+                    got = tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__
+                    raise UserValueError(
+                        f"{type(task).__name__}.episode_metrics: {name[5:]!r} must have one value for each episode, "
+                        f"shape {tuple(flight.shape[:1])}; got {got}. Take the last step of the episode by "
+                        "torchrl_quad.envs.metrics.at_episode_end(rollout, x), or write x.flatten()."
+                    )
             for name, term in group(flight, ("next", "reward_terms")).items():
                 measured[f"reward/{name}"] = cast("Tensor", (term * first).sum(1))
             of_episodes.append(measured)
@@ -99,7 +101,7 @@ def stalls(
     rows: Sequence[Mapping[str, float]], since: int, patience: float | None, least: int = 10, solved: float = 0.5
 ) -> bool:
     """Whether no evaluation has risen since the step ``since``, for ``least`` of them and a share ``patience`` of the
-    run; never where ``patience`` is None.
+    steps so far; never where ``patience`` is None.
 
     Nor does a run stall that has never solved the share ``solved`` of an evaluation's episodes, since returns stay
     level for long before a task is solved.

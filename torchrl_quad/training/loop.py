@@ -155,7 +155,7 @@ class Run:
         if self.cfg.compile and self.goes_on:
             if rank() == 0:
                 print(
-                    "Compiling the control step: about a minute. Later runs of this task find it in a cache.",
+                    "Compiling the control step: about a minute. Later runs like this find it in a cache.",
                     flush=True,
                 )
             self._warm_up()
@@ -208,8 +208,8 @@ class Run:
                     self._save(self.folder / "checkpoint.pt")
         if rank() == 0:
             if self.cfg.eval.patience is not None:
-                how, rise = "Stopped before" if self.levelled_off else "Flew all of", f"{last_rise(self.rows):,}"
-                print(f"{how} total_steps: the last evaluation that rose by 1 % was that of step {rise}.")
+                how = "Stopped before total_steps, since" if self.levelled_off else "Flew all of total_steps:"
+                print(f"{how} the last evaluation that improved by 1 % was at step {last_rise(self.rows):,}.")
             self._finish()
             print(f"{time.perf_counter() - began:.0f} s in all, {self.seconds:.0f} s of them training.")
 

@@ -77,8 +77,7 @@ def first_episode(rollout: TensorDictBase) -> Tensor:
 
 
 def at_episode_end(rollout: TensorDictBase, value: Tensor, steps: int = 1) -> Tensor:
-    """A value (num_envs, time, 1) at the last step of the first episode of each environment, (num_envs); or its mean
-    over the last ``steps`` of that episode."""
+    """The mean of a value (num_envs, time, 1) over the last steps of each environment's first episode, (num_envs)."""
     first = first_episode(rollout)
     if steps == 1:
         return value.gather(1, first.sum(1, keepdim=True) - 1).flatten()

@@ -298,6 +298,7 @@ def test_the_package_imports_its_parts_when_they_are_asked_for():
     for name in torchrl_quad.__all__:
         assert getattr(torchrl_quad, name).__module__.startswith("torchrl_quad"), name
     assert not hasattr(torchrl_quad, "Nothing") and not hasattr(torchrl_quad.deploy, "Nothing")
+    run(sys.executable, "-c", "import sys, torchrl_quad; assert 'torch' not in sys.modules")
 
 
 def test_the_recipe_exports_the_best_policy_with_results_and_a_page(

@@ -1,5 +1,6 @@
 """The environment: specs, resets, ends, seeds and delay; broken environments crash alone, and reach no others."""
 
+import inspect
 import io
 
 import pytest
@@ -11,6 +12,7 @@ from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, TransformedEn
 
 from torchrl_quad import ActionSequence, HoveringEnv, differentiable_rollout, load_drone, make_actor, make_env
 from torchrl_quad.dynamics import INTEGRATORS
+from torchrl_quad.envs import TASKS
 
 OTHER = {"integrator": "rk4", "drone": "small_racer", "control_dt": 0.01, "observe_last_action": True}
 
@@ -84,6 +86,14 @@ def test_everything_moves_to_the_gpu():
     check_env_specs(env)
     assert env.rollout(3)["next", "reward"].device.type == "cuda"
     assert HoveringEnv(num_envs=4, device="cuda").rollout(3).device.type == "cuda"
+
+
+def test_the_signature_of_a_task_names_every_argument():
+    arguments = inspect.signature(TASKS["racing"]).parameters
+    own = {"track", "reward", "gate_bonus"}
+    assert own | {"num_envs", "seed", "drone", "dynamics", "wind", "disturbances", "compile"} <= set(arguments)
+    kinds = {argument.kind for argument in arguments.values()}
+    assert not kinds & {inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL}
 
 
 def test_episode_metrics_judge_the_first_episode_by_its_last_second():
@@ -306,6 +316,19 @@ def test_a_broken_state_terminates_and_leaks_nothing_into_the_others(dtype, key,
     assert torch.equal(flight["next", "reward"][[0, 1, 3]], clean["next", "reward"][[0, 1, 3]])
     assert torch.equal(broken_action[[0, 1, 3]], clean_action[[0, 1, 3]]) and broken_action.isfinite().all()
     torch.testing.assert_close(broken_mass, clean_mass)
+
+
+@pytest.mark.parametrize(("delay", "value"), [(1, 1e30), (0, 1e7)])  # the second within what rates are clamped to
+def test_an_action_beyond_all_bounds_terminates_its_own_environment_only(delay, value):
+    env = HoveringEnv(num_envs=4, action_delay=delay)
+    action = env.hover_action.expand(4, 4).clone()
+    action[1, 2] = value
+    action.requires_grad_()
+    flight = fly(env, env.reset(), [action] * 2)
+    assert flight["next", "terminated"][:, 0].flatten().tolist() == [False, True, False, False]
+    assert flight["next", "observation"].isfinite().all()
+    (grad,) = torch.autograd.grad(flight["next", "reward"].sum(), action)
+    assert grad.isfinite().all() and grad.any(1).tolist() == [True, False, True, True]
 
 
 @cases(

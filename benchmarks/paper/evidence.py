@@ -37,6 +37,11 @@ def grouped(rows: Sequence[Row], *names: str) -> dict[tuple[str, ...], list[Row]
     return groups
 
 
+def until(curve: Iterable[tuple[float, float]], level: float) -> float:
+    """Find the steps, or seconds, at which a curve of them and returns first reaches a level, or infinity."""
+    return next((t for t, x in curve if x >= level), math.inf)
+
+
 class Judged(np.ndarray):
     """What the seeds of a method reach from one set of starts, and how far another set would shift their mean."""
 
@@ -165,9 +170,7 @@ class Results:
         """Count steps, or seconds at the pace of the quickest seed, until the curve reaches a level; or infinity."""
         returns, steps, seconds = (self.column(task, variant, name) for name in ("return", "steps", "seconds"))
         pace = min((s[-1] / n[-1] for s, n in zip(seconds, steps, strict=True) if n[-1]), default=math.nan)
-        first = [
-            next((t for t, x in zip(*c, strict=True) if x >= level), np.inf) for c in zip(steps, returns, strict=True)
-        ]
+        first = [until(zip(*curve, strict=True), level) for curve in zip(steps, returns, strict=True)]
         return np.array(first) * (pace if axis == "seconds" else 1.0)
 
     def level(self, task: str, *ends: np.ndarray) -> float:

@@ -17,7 +17,18 @@ from scipy.stats import trim_mean
 
 from benchmarks.paper import elsewhere, flights
 from benchmarks.paper.claims import METHODS, Verdict, try_all
-from benchmarks.paper.evidence import NotRunError, Results, Row, Starts, bootstrap, column, grouped, judged, probability
+from benchmarks.paper.evidence import (
+    NotRunError,
+    Results,
+    Row,
+    Starts,
+    bootstrap,
+    column,
+    grouped,
+    judged,
+    probability,
+    until,
+)
 from benchmarks.paper.matrix import EXPERIMENTS, TASKS, VARIANTS
 from torchrl_quad.envs import task_class
 from torchrl_quad.envs.metrics import EPISODE_METRICS
@@ -127,8 +138,8 @@ def ends_table(results: Results, experiment: str) -> Table:
             if experiment not in ("reward", "relaxation"):  # whose returns are of another kind
                 level = results.level(task, max((results.end(task, x) for x in METHODS), key=np.mean))
                 for axis in ("steps", "seconds"):
-                    until = np.median(results.until(task, variant, axis, level))
-                    row[f"{axis} to converge"] = f"{until:.4g}" if np.isfinite(until) else "never"
+                    reached = np.median(results.until(task, variant, axis, level))
+                    row[f"{axis} to converge"] = f"{reached:.4g}" if np.isfinite(reached) else "never"
         except NotRunError:
             continue
         rows.append(row)
@@ -247,17 +258,16 @@ def choice_table(rows: Sequence[Row], starts: Starts, curves: Sequence[Row] = ()
         row = {"task": LABELS.get(task, task), "quickest that works with every seed": said.get(quick, "none")}
         row |= {"highest return": said[most], "level with it": ", ".join(level)}
         goal = max((returns[x] for x in tried if x != "train"), default=math.inf)
-        came = [until(own, goal - 0.02 * abs(goal)) for (of, _), own in untuned.items() if of == task]
+        came = [
+            until(((float(x["seconds"]), float(x["return"] or "nan")) for x in own), goal - 0.02 * abs(goal))
+            for (of, _), own in untuned.items()
+            if of == task
+        ]
         if came and goal < math.inf:
             when = f"{np.median(came):.0f} s, " if np.median(came) < math.inf else ""
             row["One setting at 98 % of the best tuned"] = f"{when}{np.isfinite(came).sum()} of {seeds(len(came))}"
         lines.append(row)
     return lines
-
-
-def until(curve: Sequence[Row], level: float) -> float:
-    """Seconds until the returns of a curve reach a level; infinite where none does."""
-    return min((float(x["seconds"]) for x in curve if float(x["return"] or "nan") >= level), default=math.inf)
 
 
 def speed_table(rows: Sequence[Row]) -> Table:

@@ -43,15 +43,16 @@ def evaluate(
                 env, actor, None, task.max_episode_steps, exploration_type=ExplorationType.DETERMINISTIC
             )
             first = first_episode(flight)
-            measured = {f"eval/{name}": x for name, x in task.episode_metrics(flight).items()}
-            for name, x in measured.items():
+            found = task.episode_metrics(flight)
+            for name, x in found.items():
                 if not isinstance(x, Tensor) or x.shape != flight.shape[:1]:
                     got = tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__
                     raise UserValueError(
-                        f"{type(task).__name__}.episode_metrics: {name[5:]!r} must have one value for each episode, "
+                        f"{type(task).__name__}.episode_metrics: {name!r} must have one value for each episode, "
                         f"shape {tuple(flight.shape[:1])}; got {got}. Take the last step of the episode by "
                         "torchrl_quad.envs.metrics.at_episode_end(rollout, x), or write x.flatten()."
                     )
+            measured = {f"eval/{name}": x for name, x in found.items()}
             for name, term in group(flight, ("next", "reward_terms")).items():
                 measured[f"reward/{name}"] = cast("Tensor", (term * first).sum(1))
             of_episodes.append(measured)

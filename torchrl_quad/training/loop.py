@@ -154,10 +154,7 @@ class Run:
         began = time.perf_counter()
         if self.cfg.compile and self.goes_on:
             if rank() == 0:
-                print(
-                    "Compiling the control step: about a minute. Later runs like this find it in a cache.",
-                    flush=True,
-                )
+                print("Compiling the control step: about a minute, or 6 s where it is in the cache.", flush=True)
             self._warm_up()
             if rank() == 0:
                 print(f"Compiled in {time.perf_counter() - began:.0f} s.", flush=True)

@@ -320,9 +320,11 @@ def test_random_obstacles_keep_clear_of_the_start_and_of_the_target(kind, size):
     assert env.scene.radius + 0.5 <= gaps < env.scene.radius + 0.55  # some stand as near as they may
 
 
-def test_critics_read_how_far_the_nearest_obstacle_is_and_where_it_is_not():
+def test_critics_read_how_far_the_nearest_obstacle_is_and_will_be_and_where_it_is_not():
     half = math.sqrt(0.5)
     env = HoveringEnv(num_envs=1, scene=POLE, dtype=torch.float64)
     to_the_left = [half, 0.0, 0.0, half]  # along y
-    seen = start(env, position=[4.0, 0.0, 2.0], quaternion=to_the_left)["obstacle"]
-    assert seen.flatten().tolist() == pytest.approx([0.8 - env.scene.radius, 0.0, 1.0, 0.0], abs=1e-9)
+    state = start(env, position=[4.0, 0.0, 2.0], quaternion=to_the_left, velocity=[0.6, 0.0, 0.0])
+    gap, direction = [0.8 - env.scene.radius], [0.0, 1.0, 0.0]
+    later = [distance - env.scene.radius for distance in (0.65, 0.5, 0.2)]  # in 0.25, 0.5 and 1 s
+    assert state["obstacle"].flatten().tolist() == pytest.approx([*gap, *direction, *later], abs=1e-9)

@@ -202,6 +202,7 @@ POLICIES = {  # recipe, and what differs from what it ships with
     "no memory": ("bptt", [HALF, "actor.recurrent=false"]),
     "no velocity": ("bptt", [HALF, "env.observe_velocity=false"]),
     "blind": ("bptt", [HALF, "actor.vision=false", "env.camera=null"]),
+    "one setting": ("train", [HALF]),
     "shac": ("shac", []),
     "hybrid": ("hybrid", []),
     "ppo": ("ppo", ["total_steps=2_880_000"]),  # about the seconds of BPTT

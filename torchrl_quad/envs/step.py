@@ -22,6 +22,7 @@ from torchrl_quad.envs.terms import time_terms
 from torchrl_quad.errors import UserValueError
 
 Outputs = dict[str, Any]  # of a step by name; mappings of names hold further ones
+LOOK_AHEAD = (0.0, 0.25, 0.5, 1.0)  # [s], in which a critic sees a drone come near an obstacle at its velocity
 
 
 class ControlStep:
@@ -120,8 +121,10 @@ class ControlStep:
         if isinstance(camera := env.disturbances.get("camera"), MountedCamera):
             more["depth"] = camera.image(state)
         if env.scene is not None:  # for critics, which may know more than policies
-            distance, away = env.scene.nearest(state)
-            more["obstacle"] = torch.cat((distance, quaternion.rotate_inverse(state["quaternion"], away)), -1)
+            coming = [state["position"] + time * state["velocity"] for time in LOOK_AHEAD]
+            distance, away = env.scene.nearest({**state, "position": torch.stack(coming, 1)})
+            away = quaternion.rotate_inverse(state["quaternion"], away[:, 0])
+            more["obstacle"] = torch.cat((distance[:, :1, 0], away, distance[:, 1:, 0]), -1)
         return {"observation": self.observe(state), **more, "metrics": metrics}
 
     def observe(self, state: State) -> Tensor:

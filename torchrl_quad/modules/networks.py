@@ -53,7 +53,8 @@ def make_value(
     LayerNorm normalises its hidden layers: without it the gradient of the critic, which the policy follows, is far off.
     A critic may read more than the actor does, such as ``in_keys=("observation", ("state", "rotor_speed"))``. Rotors
     turn at some 1000 rad/s, and ``input_scale=(1.0, 1e-3)`` brings both entries to about one. Among obstacles,
-    ``"obstacle"`` (*, 4) is the distance to the nearest [m], and the direction away from it in the body frame.
+    ``"obstacle"`` (*, 7) is the distance to the nearest [m], the direction away from it in the body frame, and the
+    distances in 0.25, 0.5 and 1 s at the present velocity.
 
     Args:
         env, activation, input_scale, in_keys: as for :func:`~torchrl_quad.make_actor`, and so are the errors.

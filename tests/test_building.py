@@ -107,6 +107,8 @@ def test_what_critics_are_to_read_must_be_in_the_state(key, factor):
         privileged = {key: factor}
 
     refuses(rf"Wrong.privileged must be entries of the state, .* got '{key}': {factor!r}. The state has: ", Wrong)
+    Wrong.privileged = [key]
+    refuses(rf"Wrong.privileged must be entries of the state, .* got \['{key}'\]", Wrong)
 
 
 @cases(("constant", 1e-2, 1e-2), ("linear", 5.05e-3, 1e-4), ("exponential", 1e-3, 1e-4), ("cosine", 5.05e-3, 1e-4))

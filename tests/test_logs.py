@@ -7,12 +7,14 @@ import time
 from collections import Counter
 
 import pytest
+import torch
 import yaml
 from conftest import RECIPES
 from helpers import EVERYTHING, SMALL, assert_equal, cases, poison, rows, stop_at_save
 from omegaconf import OmegaConf
 from torchrl import torchrl_logger
 
+from torchrl_quad.envs import HoveringEnv
 from torchrl_quad.files import read_rows
 from torchrl_quad.training import loop
 from torchrl_quad.training.checkpoints import read_checkpoint, revision
@@ -157,6 +159,18 @@ def test_a_run_that_solves_nothing_says_what_may_be_the_reason(train, tmp_path, 
     train("bptt", tmp_path, "task=racing", "env.weights={gate: 0}", "total_steps=480", "eval.interval=1")
     starts = [x.partition(" Perhaps ")[2][:18] for x in said if x.startswith("Nothing is solved after 120 steps.")]
     assert starts == ["as this policy fli", "all episodes end a"] and len(said) == 2
+
+
+def test_a_run_that_solves_few_episodes_says_so_at_its_end(train, tmp_path, monkeypatch):
+    said, of_episodes = [], HoveringEnv.episode_metrics
+    monkeypatch.setattr(torchrl_logger, "warning", said.append)
+
+    def fourth(env, flight):
+        return of_episodes(env, flight) | {"solved": torch.arange(len(flight)) % 4 == 0}
+
+    monkeypatch.setattr(HoveringEnv, "episode_metrics", fourth)
+    train("bptt", tmp_path, "task=hovering", "num_envs=4", "total_steps=48", "eval.interval=1")
+    assert said and all(x.startswith("At most 25% of the episodes are solved after 48 steps. Perhaps ") for x in said)
 
 
 def test_a_task_of_your_own_is_audited_before_it_trains_which_changes_nothing(train, tmp_path, monkeypatch):

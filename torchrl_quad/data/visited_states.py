@@ -249,7 +249,12 @@ def restart(env: EnvBase, carry: TensorDictBase, fraction: Fraction) -> TensorDi
 
 def _state_keys(env: EnvBase) -> tuple[NestedKey, ...]:
     """The first names of the entries that make up the Markov state."""
-    return tuple(dict.fromkeys(key if isinstance(key, str) else key[0] for key in state_keys(env)))
+    if keys := state_keys(env):
+        return tuple(dict.fromkeys(key if isinstance(key, str) else key[0] for key in keys))
+    raise UserValueError(
+        f"{type(base_env(env)).__name__} cannot be set to a state: its state_spec names no entry of it. Declare them "
+        "there and start from them in reset(tensordict, set_state=True), or reset every rollout instead."
+    )
 
 
 def _fresh(env: EnvBase, keys: Sequence[NestedKey]) -> TensorDictBase:

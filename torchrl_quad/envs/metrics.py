@@ -41,6 +41,7 @@ class Metric:
 
     def summarise(self, values: Tensor) -> float:
         """The average over episodes (n), without those that have no value, which are NaN."""
+        values = values if values.is_floating_point() else values.float()  # such as a bool, whether it was solved
         return (values.nanmedian() if self.median else values.nanmean()).item()
 
     def format(self, value: float) -> str:

@@ -88,7 +88,10 @@ def make_env(task: str, **kwargs: Any) -> QuadrotorEnv:
 def _checked_class(cls: Any, source: str) -> type[QuadrotorEnv]:
     if not (isinstance(cls, type) and issubclass(cls, QuadrotorEnv)):
         got = f"the class {cls.__name__}" if isinstance(cls, type) else type(cls).__name__
-        raise UserTypeError(f"{source}: a task is a subclass of QuadrotorEnv, itself and not an instance; got {got}.")
+        raise UserTypeError(
+            f"{source}: a task is a subclass of QuadrotorEnv, itself and not an instance; got {got}. To train in "
+            "another environment write the loop, as examples/08_abpt_on_another_environment.py does."
+        )
     if inspect.isabstract(cls):
         missing = ", ".join(sorted(cls.__abstractmethods__))
         raise UserTypeError(f"{source}: {cls.__name__} lacks {missing}. docs/writing.md says what each of them gives.")

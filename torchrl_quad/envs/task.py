@@ -314,10 +314,12 @@ def check_task(env: Task, state: State) -> dict[Key, Disturbance]:
     missing = sorted(env.metric_info.keys() - EPISODE_METRICS.keys() - metrics.keys())
     adds_some = type(env).episode_metrics is not Task.episode_metrics  # which may give what metrics() lacks
     check(adds_some or not missing, f"metrics(state) lacks {', '.join(missing)}, which metric_info describes.")
-    for key, factor in ((key, x) for each in (env, *env.disturbances.values()) for key, x in each.privileged.items()):
-        is_right = isinstance(factor, numbers.Real) and key in state and state[key].dim() == 2
-        hint = "must be entries of the state, (n, k), each with a factor, such as {'position': 1.0}"
-        check(is_right, f"privileged {hint}; got {key!r}: {factor!r}. The state has: {', '.join(map(str, state))}.")
+    for own in (each.privileged for each in (env, *env.disturbances.values())):
+        hint = "privileged must be entries of the state, (n, k), each with a factor, such as {'position': 1.0}; got"
+        check(isinstance(own, Mapping), f"{hint} {own!r}.")
+        for key, factor in own.items():
+            is_right = isinstance(factor, numbers.Real) and key in state and state[key].dim() == 2
+            check(is_right, f"{hint} {key!r}: {factor!r}. The state has: {', '.join(map(str, state))}.")
     for method in ("is_crash", "is_success"):
         check_tensor(f"{method}(state)", call(method, state), torch.bool)
     advanced = call("advance", state, state)

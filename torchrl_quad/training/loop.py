@@ -207,6 +207,8 @@ class Run:
             if self.cfg.eval.patience is not None:
                 how = "Stopped before total_steps, since" if self.levelled_off else "Flew all of total_steps:"
                 print(f"{how} the last evaluation that improved by 1 % was at step {last_rise(self.rows):,}.")
+            if 0.0 < max((x["eval/solved"] for x in self.rows), default=0.0) < 0.5:
+                self._warn(self.rows[-1]["eval/crash"])
             self._finish()
             print(f"{time.perf_counter() - began:.0f} s in all, {self.seconds:.0f} s of them training.")
 
@@ -326,11 +328,13 @@ class Run:
         self.carry = self.env.reset()
 
     def _warn(self, crash: float) -> None:
-        """Say why a run that has solved nothing may never learn: the traps of the reward, and the time limit."""
+        """Say why a run that solves nothing, or little, may not learn: the traps of the reward, and the time limit."""
+        solved = max(x["eval/solved"] for x in self.rows)
+        result = f"At most {solved:.0%} of the episodes are solved" if solved else "Nothing is solved"
         seconds = self.task.max_episode_steps * self.task.control_dt
         limit = f"all episodes end after {seconds:.3g} s: if drones still come nearer then, set max_episode_steps"
         for trap in [*self._traps(), *([limit] if crash < 0.05 else [])]:
-            torchrl_logger.warning(f"Nothing is solved after {self.steps:,} steps. Perhaps {trap}.")
+            torchrl_logger.warning(f"{result} after {self.steps:,} steps. Perhaps {trap}.")
 
     def _traps(self) -> Sequence[str]:
         """What the audit of the next horizon's reward says; change nothing."""

@@ -353,6 +353,9 @@ def test_a_task_may_have_other_defaults_of_arguments_that_callers_and_recipes_se
     assert defaults(NearEnv) == {**defaults(CornerEnv), "reach": 0.1, "drone": "racer"}
     NearEnv.defaults = {"drne": "racer"}
     refuses("argument 'drne'. Did you mean 'drone'", NearEnv, error=TypeError)
+    for name, value in (("drone", "racer"), ("control_dt", 0.01), ("reach", 0.1)):
+        message = f"FarEnv.{name} is an argument, .* Write defaults = {{'{name}': {value!r}}}."
+        refuses(message, type, "FarEnv", (CornerEnv,), {name: value}, error=TypeError)
 
 
 def test_a_metric_that_is_described_and_not_given_is_named():

@@ -131,7 +131,7 @@ def cross(a: Vector, b: Vector) -> Vector:
     if isinstance(a, Components):
         (ax, ay, az), (bx, by, bz) = parts(a), parts(b)
         return Components((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
-    return torch.linalg.cross(a, b)
+    return torch.linalg.cross(a, b) if a.dim() == b.dim() else torch.linalg.cross(*torch.broadcast_tensors(a, b))
 
 
 def dot(a: Vector, b: Vector) -> Vector:

@@ -153,6 +153,15 @@ def looks_ahead(rows: Sequence[Mapping[str, float]], patience: float | None) -> 
     return patience is not None and any(stalls(rows[:n], 0, patience, solved=0) for n in range(30, len(rows) + 1))
 
 
+def why_unsolved(rows: Sequence[Mapping[str, float]], seconds: float) -> list[str]:
+    """What may keep a run of episodes of so many seconds from solving more, besides traps of the reward."""
+    if rows[-1]["eval/crash"] >= 0.05:
+        return []
+    if stalls(rows, 0, 0.33, solved=0.0):
+        return ["reward and success disagree: returns have levelled off, and a good flight is still not solved"]
+    return [f"all episodes end after {seconds:.3g} s: if drones still come nearer then, set max_episode_steps"]
+
+
 @contextlib.contextmanager
 def drawing_from(env: EnvBase, seed: int) -> Iterator[None]:
     """Let the environment draw from a seed for a while; its own random numbers then continue where they were."""

@@ -59,6 +59,7 @@ from torchrl_quad.training.evaluation import (
     report,
     rounds,
     title,
+    why_unsolved,
 )
 from torchrl_quad.training.logs import Logs
 
@@ -207,8 +208,8 @@ class Run:
             if self.cfg.eval.patience is not None:
                 how = "Stopped before total_steps, since" if self.levelled_off else "Flew all of total_steps:"
                 print(f"{how} the last evaluation that improved by 1 % was at step {last_rise(self.rows):,}.")
-            if 0.0 < max((x["eval/solved"] for x in self.rows), default=0.0) < 0.5:
-                self._warn(self.rows[-1]["eval/crash"])
+            if len(self.rows) >= 10 and max(x["eval/solved"] for x in self.rows) < 0.5:
+                self._warn()
             self._finish()
             print(f"{time.perf_counter() - began:.0f} s in all, {self.seconds:.0f} s of them training.")
 
@@ -308,7 +309,7 @@ class Run:
             self.logs.show_flight(self.steps)
         late = [i >= 4 and x["steps"] >= 0.1 * self.total_steps for i, x in enumerate(self.rows)]
         if sum(late) == 1 and late[-1] and not any(x["eval/solved"] for x in self.rows):
-            self._warn(metrics["eval/crash"])
+            self._warn()
         score = {name: metrics[f"eval/{name}"] for name in ("solved", "return")}
         patience = self.cfg.eval.patience
         if math.isfinite(score["return"]) and merit(score, patience) >= merit(self.best, patience):
@@ -327,13 +328,12 @@ class Run:
         self.actor.load_state_dict(self.flown.state_dict())
         self.carry = self.env.reset()
 
-    def _warn(self, crash: float) -> None:
-        """Say why a run that solves nothing, or little, may not learn: the traps of the reward, and the time limit."""
+    def _warn(self) -> None:
+        """Say why a run that solves nothing, or little, may not learn."""
         solved = max(x["eval/solved"] for x in self.rows)
         result = f"At most {solved:.0%} of the episodes are solved" if solved else "Nothing is solved"
         seconds = self.task.max_episode_steps * self.task.control_dt
-        limit = f"all episodes end after {seconds:.3g} s: if drones still come nearer then, set max_episode_steps"
-        for trap in [*self._traps(), *([limit] if crash < 0.05 else [])]:
+        for trap in [*self._traps(), *why_unsolved(self.rows, seconds)]:
             torchrl_logger.warning(f"{result} after {self.steps:,} steps. Perhaps {trap}.")
 
     def _traps(self) -> Sequence[str]:

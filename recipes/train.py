@@ -44,7 +44,7 @@ def main(cfg: DictConfig) -> None:
 
         update_normalizer(env, rollout)
         run.carry = restart(env, end, cfg.restart_fraction)
-        loss.adapt_horizon(mean_of_all(metrics["stiffness"]), mean_of_all(metrics["typical_stiffness"]))
+        loss.adapt_horizon(mean_of_all(metrics["stiffness"]))
         run.record(horizon=run.horizon, rate=rate, pace=run.pace, scale=scale.value, loss_actor=loss_actor)
         run.record(**metrics, **critic_metrics)
 

@@ -304,7 +304,7 @@ def train_one_setting(environment: str, seed: int) -> tuple[float, float, float]
         share = max(actor_optimizer.param_groups[0]["lr"] / actor_optimizer.first_lr, 1 / 3)
         for batch in minibatches(data, cfg.critic, 1 / share):
             optimise(critic_optimizer, loss.loss_value(batch)[0], cfg.critic.max_grad_norm)
-        loss.adapt_horizon(metrics["stiffness"], metrics["typical_stiffness"])
+        loss.adapt_horizon(metrics["stiffness"])
         return rollout, carry
 
     return learn(environment, place, average.module, iterate, (actor_optimizer, critic_optimizer))

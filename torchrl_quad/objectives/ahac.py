@@ -16,7 +16,6 @@ from torchrl_quad.objectives.shac import SHACLoss
 from torchrl_quad.options import Below1, Copies, Field, Horizon, Share
 
 SMOOTHING = 0.2  # how much of the multiplier is new in each iteration
-SHORTEST, LEAST_LMBDA = 8, 0.8  # how much further than to min_horizon a lambda shortens it, and the least lambda then
 
 
 class AHACLoss(SHACLoss):
@@ -28,10 +27,6 @@ class AHACLoss(SHACLoss):
     at a bound by a Lagrange multiplier phi on a horizon of N steps:
 
         phi <- phi + 0.2 (clip(stiffness / max_stiffness - 1, -1, 1) - phi),    N <- N exp(-horizon_lr phi)
-
-    Below ``min_horizon`` the rollout stays as long, and ``gradient_lmbda`` falls instead, to its power of
-    min_horizon / N: only where most environments are stiff, each by its own median (``typical_stiffness``). Policies
-    with a memory may become so.
 
     The least of two critics without target networks is the value at the end of the horizon, and that of their targets.
     Georgiev et al. average over the horizon.
@@ -61,7 +56,7 @@ class AHACLoss(SHACLoss):
         **kwargs: as for :class:`SHACLoss`.
     """
 
-    measured_of_actions = ["stiffness", "typical_stiffness"]
+    measured_of_actions = ["stiffness"]
 
     def __init__(
         self,
@@ -97,43 +92,31 @@ class AHACLoss(SHACLoss):
     @property
     def horizon(self) -> int:
         """Control steps of the next rollout; a checkpoint of the loss holds it."""
-        return max(round(self.length.item()), self.min_horizon)
+        return round(self.length.item())
 
     @torch.no_grad()
-    def adapt_horizon(self, stiffness: Tensor, typical: Tensor | None = None) -> None:
+    def adapt_horizon(self, stiffness: Tensor) -> None:
         """Shorten the horizon if the stiffness is above its bound, and lengthen it if it is below.
 
         The stiffness is a scalar, as ``loss_actor`` measured it, of several processes their mean. Infinity, for a
-        gradient that is not finite, shortens the horizon; NaN, for no gradient at all, changes nothing. With the
-        typical stiffness, and ``gradient_lmbda`` below 1, it may become shorter than ``min_horizon``.
+        gradient that is not finite, shortens the horizon; NaN, for no gradient at all, changes nothing.
         """
-        low = self.min_horizon
-        if typical is not None and self.gradient_lmbda < 1.0:
-            is_below = self.length.item() < low
-            low = low / SHORTEST if is_below or typical > self.max_stiffness else low
-            stiffness = typical if is_below else stiffness
         if stiffness.isnan():
             return
         excess = (stiffness.to(self.length) / self.max_stiffness - 1.0).clamp(-1.0, 1.0)
         self.multiplier.lerp_(excess, SMOOTHING)
-        self.length.mul_((-self.horizon_lr * self.multiplier).exp()).clamp_(low, self.max_horizon)
+        self.length.mul_((-self.horizon_lr * self.multiplier).exp()).clamp_(self.min_horizon, self.max_horizon)
 
     def _action_gradient(self, tensordict: TensorDictBase, objective: Tensor) -> Tensor:
         if self.gradient_lmbda == 1.0:
             return super()._action_gradient(tensordict, objective)
-        shorter = self.gradient_lmbda ** max(self.min_horizon / self.length.item(), 1.0)
-        grad = self._own_gradient(tensordict, max(shorter, min(self.gradient_lmbda, LEAST_LMBDA)))
+        grad = self._own_gradient(tensordict, self.gradient_lmbda)
         return grad / tensordict.shape[-1] if self.average_over_horizon else grad
 
     def _measure(self, grad: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         length = grad.norm(dim=-1)
         counts = length > 0  # the last actions move nothing within the horizon
         stiffness = (length.square().sum() / counts.sum()).sqrt() / median_length(length)
-        own = (
-            length.square().sum(-1).div(counts.sum(-1)).sqrt() / torch.where(counts, length, torch.nan).nanmedian(-1)[0]
-        )
-        is_finite, infinite = length.isfinite(), torch.full_like(stiffness, math.inf)
-        stiffness = torch.where(is_finite.all(), stiffness, infinite)
-        typical = torch.where(is_finite.all(-1), own, infinite).nanmedian()
+        stiffness = torch.where(length.isfinite().all(), stiffness, math.inf)
         grad, measured = super()._measure(grad)
-        return grad, {"stiffness": stiffness, "typical_stiffness": typical, **measured}
+        return grad, {"stiffness": stiffness, **measured}

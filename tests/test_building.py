@@ -101,7 +101,7 @@ def test_critics_read_what_a_task_or_a_disturbance_keeps_from_policies_which_the
     assert "recurrent_state" not in forgets.in_keys
 
 
-@cases(("mass", 1.0), ("position", "large"), ("position", None))
+@cases(("mass", 1.0), ("position", "large"), ("position", None), ("position", float("nan")))
 def test_what_critics_are_to_read_must_be_in_the_state(key, factor):
     class Wrong(HoveringEnv):
         privileged = {key: factor}

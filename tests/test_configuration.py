@@ -354,8 +354,9 @@ def test_a_task_may_have_other_defaults_of_arguments_that_callers_and_recipes_se
     NearEnv.defaults = {"drne": "racer"}
     refuses("argument 'drne'. Did you mean 'drone'", NearEnv, error=TypeError)
     for name, value in (("drone", "racer"), ("control_dt", 0.01), ("reach", 0.1)):
-        message = f"FarEnv.{name} is an argument, .* Write defaults = {{'{name}': {value!r}}}."
-        refuses(message, type, "FarEnv", (CornerEnv,), {name: value}, error=TypeError)
+        both = dict(sorted({"num_envs": 3, name: value}.items()))
+        message = f"FarEnv.{name} is an argument, .* Write defaults = {both}."
+        refuses(message, type, "FarEnv", (CornerEnv,), {name: value, "defaults": {"num_envs": 3}}, error=TypeError)
 
 
 def test_a_metric_that_is_described_and_not_given_is_named():

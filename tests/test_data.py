@@ -248,7 +248,7 @@ def test_an_empty_buffer_a_bad_fraction_or_capacity_and_states_of_other_tasks_ar
 def test_an_environment_that_does_not_declare_its_state_is_not_set_to_one():
     pendulum = PendulumEnv(seed=0)
     pendulum.state_spec = None
-    message = "PendulumEnv cannot be set to a state: its state_spec names no entry of it. Declare them there"
+    message = "PendulumEnv cannot be set to a state: its state_spec is empty. Declare the entries of its Mark"
     _, carry = differentiable_rollout(pendulum, TORQUE, None, 4)
     refuses(message, restart, pendulum, carry, 0.5)
     refuses(message, VisitedStateBuffer, 8, pendulum)

@@ -210,6 +210,7 @@ def test_rotations_agree_with_the_rotation_matrix_and_invert_each_other():
     one_by_one = quaternion.rotate(p, quaternion.rotate(q, v))
     torch.testing.assert_close(quaternion.rotate(quaternion.multiply(p, q), v), one_by_one)
     assert torch.equal(quaternion.rotate(q, v[0]), quaternion.rotate(q, v[:1].expand(5, 3)))
+    assert torch.equal(quaternion.multiply(p, q[0]), quaternion.multiply(p, q[:1].expand(5, 4)))
     assert torch.equal(quaternion.rotate(q.unsqueeze(1), v)[:, 2], quaternion.rotate(q, v[2:3]))
 
 

@@ -252,8 +252,9 @@ def _state_keys(env: EnvBase) -> tuple[NestedKey, ...]:
     if keys := state_keys(env):
         return tuple(dict.fromkeys(key if isinstance(key, str) else key[0] for key in keys))
     raise UserValueError(
-        f"{type(base_env(env)).__name__} cannot be set to a state: its state_spec names no entry of it. Declare them "
-        "there and start from them in reset(tensordict, set_state=True), or reset every rollout instead."
+        f"{type(base_env(env)).__name__} cannot be set to a state: its state_spec is empty. Declare the "
+        "entries of its Markov state there, and start from them in _reset(tensordict, set_state=True), with "
+        "_supports_set_state = True; or begin every rollout with env.reset()."
     )
 
 

@@ -14,7 +14,7 @@ def multiply(p: Tensor, q: Tensor) -> Tensor:
     """Hamilton product p q, (*, 4): the rotation q followed, in the outer frame, by p."""
     (pw, pv), (qw, qv) = p.split((1, 3), -1), q.split((1, 3), -1)
     scalar = pw * qw - dot(pv, qv)
-    return torch.cat((scalar, pw * qv + qw * pv + torch.linalg.cross(pv, qv)), -1)
+    return torch.cat((scalar, pw * qv + qw * pv + cross(pv, qv)), -1)
 
 
 def identity(like: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenes import MountedCamera
 from torchrl_quad.envs.step import ControlStep, sample_state
 from torchrl_quad.envs.task import Task, check_task
-from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.errors import UserTypeError, UserValueError, shown
 from torchrl_quad.options import Delay, Device, Horizon, Seed, Share, Size, check_value, checked
 
 
@@ -196,11 +196,11 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
         if "__init__" in vars(cls):
             checked(cls)
         cls.__signature__ = config.full_signature(cls, EnvBase)
-        for name in (cls.__signature__.parameters.keys() & vars(cls).keys()) - {"weights"}:
-            if not isinstance(value := vars(cls)[name], property):
+        for name in sorted(cls.__signature__.parameters.keys() & vars(cls).keys() - {"weights"}):
+            if not hasattr(value := vars(cls)[name], "__get__"):  # as methods and properties have
                 raise UserTypeError(
                     f"{cls.__name__}.{name} is an argument, which an attribute of the class does not change. Write "
-                    f"defaults = {{{name!r}: {value!r}}}."
+                    f"defaults = {shown({**cls.defaults, name: value})}."
                 )
 
     def __repr__(self) -> str:

@@ -40,7 +40,7 @@ class LandingEnv(QuadrotorEnv):
     an episode: that it ended in success.
 
     Metrics: ``position_error``, the horizontal distance to the target [m]; ``landing_speed``, the speed [m/s]. Of an
-    episode, the values at its end; ``landing_speed`` is NaN where the drone did not come down.
+    episode, the values at its end; ``landing_speed`` is NaN where the drone neither came down nor solved it.
     """
 
     target = (2.0, 0.0, 0.0)  # [m]

@@ -22,7 +22,7 @@ from torchrl_quad.envs.terms import time_terms
 from torchrl_quad.errors import UserValueError
 
 Outputs = dict[str, Any]  # of a step by name; mappings of names hold further ones
-LOOK_AHEAD = (0.0, 0.25, 0.5, 1.0)  # [s], in which a critic sees a drone come near an obstacle at its velocity
+LOOK_AHEAD = (0.0, 0.25, 0.5, 1.0)  # [s]: critics read how near obstacles are, and will be at the present velocity
 
 
 class ControlStep:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import math
 import numbers
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, cast
@@ -314,12 +315,14 @@ def check_task(env: Task, state: State) -> dict[Key, Disturbance]:
     missing = sorted(env.metric_info.keys() - EPISODE_METRICS.keys() - metrics.keys())
     adds_some = type(env).episode_metrics is not Task.episode_metrics  # which may give what metrics() lacks
     check(adds_some or not missing, f"metrics(state) lacks {', '.join(missing)}, which metric_info describes.")
-    for own in (each.privileged for each in (env, *env.disturbances.values())):
+    for each in (env, *env.disturbances.values()):
         hint = "privileged must be entries of the state, (n, k), each with a factor, such as {'position': 1.0}; got"
-        check(isinstance(own, Mapping), f"{hint} {own!r}.")
-        for key, factor in own.items():
+        hint = f"{type(each).__name__}.{hint}"
+        _check(isinstance(each.privileged, Mapping), f"{hint} {each.privileged!r}.")
+        for key, factor in each.privileged.items():
             is_right = isinstance(factor, numbers.Real) and key in state and state[key].dim() == 2
-            check(is_right, f"{hint} {key!r}: {factor!r}. The state has: {', '.join(map(str, state))}.")
+            is_right = is_right and math.isfinite(factor)
+            _check(is_right, f"{hint} {key!r}: {factor!r}. The state has: {', '.join(map(str, state))}.")
     for method in ("is_crash", "is_success"):
         check_tensor(f"{method}(state)", call(method, state), torch.bool)
     advanced = call("advance", state, state)

@@ -157,9 +157,10 @@ def why_unsolved(rows: Sequence[Mapping[str, float]], seconds: float) -> list[st
     """What may keep a run of episodes of so many seconds from solving more, besides traps of the reward."""
     if rows[-1]["eval/crash"] >= 0.05:
         return []
-    if stalls(rows, 0, 0.33, solved=0.0):
-        return ["reward and success disagree: returns have levelled off, and a good flight is still not solved"]
-    return [f"all episodes end after {seconds:.3g} s: if drones still come nearer then, set max_episode_steps"]
+    rose = last_rise(rows) > rows[0]["steps"]
+    disagree = "reward and success disagree: returns have levelled off, and most episodes are not solved"
+    limit = f"all episodes end after {seconds:.3g} s: if drones still come nearer then, set max_episode_steps"
+    return [disagree, limit] if rose and stalls(rows, 0, 0.33, solved=0.0) else [limit]
 
 
 @contextlib.contextmanager

@@ -208,9 +208,9 @@ class Run:
             if self.cfg.eval.patience is not None:
                 how = "Stopped before total_steps, since" if self.levelled_off else "Flew all of total_steps:"
                 print(f"{how} the last evaluation that improved by 1 % was at step {last_rise(self.rows):,}.")
+            self._finish()
             if len(self.rows) >= 10 and max(x["eval/solved"] for x in self.rows) < 0.5:
                 self._warn()
-            self._finish()
             print(f"{time.perf_counter() - began:.0f} s in all, {self.seconds:.0f} s of them training.")
 
     def optimise(self, optimizer: Optimizer, loss: Tensor) -> bool:
@@ -331,7 +331,7 @@ class Run:
     def _warn(self) -> None:
         """Say why a run that solves nothing, or little, may not learn."""
         solved = max(x["eval/solved"] for x in self.rows)
-        result = f"At most {solved:.0%} of the episodes are solved" if solved else "Nothing is solved"
+        result = f"At most {100 * solved:.2g} % of the episodes are solved" if solved else "Nothing is solved"
         seconds = self.task.max_episode_steps * self.task.control_dt
         for trap in [*self._traps(), *why_unsolved(self.rows, seconds)]:
             torchrl_logger.warning(f"{result} after {self.steps:,} steps. Perhaps {trap}.")

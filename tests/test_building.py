@@ -160,7 +160,10 @@ def test_a_run_stalls_when_no_evaluation_has_risen_for_a_share_of_it_and_levels_
     assert [stalls(curve, x, 0.3, least=3) for x in (60, 70, 80)] == [True, True, False]
     assert not stalls(curve, 0, 0.5) and not stalls([], 0, 0.5)  # too few evaluations to say
     low = [row | {"eval/solved": 0.4} for row in curve]
-    assert not stalls(low, 0, 0.5, least=6)  # the task is not solved
+    assert not stalls(low, 0, 0.5, least=6)  # the task is not solved, and 30 evaluations are too few to say
+    long = low + [low[-1] | {"steps": 100.0 + i, "eval/solved": 0.3 + 0.004 * i} for i in range(1, 31)]
+    assert [stalls(long[:n], 0, 0.2) for n in (34, 39)] == [True, True] and not stalls(long[:33], 0, 0.2)
+    assert stalls(long[:15] + long[-1:], 0, 0.2, least=5) is False and not stalls(long, 66, 0.2)
     later = [row | {"steps": 100.0 + 10 * i} for i, row in enumerate(curve[-1:] * 20)]
     level = [has_levelled_off(curve + later, since, 0.5) for since in (0, 40, 50, 140, 150)]
     assert level == [False, False, True, True, False]

@@ -104,11 +104,13 @@ def stalls(
     """Whether no evaluation has risen since the step ``since``, for ``least`` of them and a share ``patience`` of the
     steps so far; never where ``patience`` is None.
 
-    Nor does a run stall that has never solved the share ``solved`` of an evaluation's episodes, since returns stay
-    level for long before a task is solved.
+    Returns may stay level for long before a task is solved. So a run that has never solved the share ``solved`` of an
+    evaluation's episodes stalls where its return has not risen for half of the steps, and 30 evaluations.
     """
-    if patience is None or not rows or max(row["eval/solved"] for row in rows) < solved:
+    if patience is None or not rows:
         return False
+    if max(row["eval/solved"] for row in rows) < solved:
+        patience, least, rows = max(patience, 0.5), max(least, 30), [{**row, "eval/solved": 0.0} for row in rows]
     since = max(since, last_rise(rows))
     return sum(row["steps"] > since for row in rows) >= least and since <= (1.0 - patience) * rows[-1]["steps"]
 
@@ -129,7 +131,8 @@ def has_lost_its_way(rows: Sequence[Mapping[str, float]], patience: float | None
 
 def has_levelled_off(rows: Sequence[Mapping[str, float]], since: int, patience: float | None) -> bool:
     """Whether a run that has solved a task stalls again after the stall in the step ``since``, with no rise between."""
-    return since > last_rise(rows) and stalls(rows, since, patience, solved=SOLVED)
+    has_solved = any(row["eval/solved"] >= SOLVED for row in rows)
+    return has_solved and since > last_rise(rows) and stalls(rows, since, patience)
 
 
 STALLED = 0.25  # by which a stall changes the pace

@@ -22,7 +22,7 @@ from torchrl_quad.envs.terms import time_terms
 from torchrl_quad.errors import UserValueError
 
 Outputs = dict[str, Any]  # of a step by name; mappings of names hold further ones
-LOOK_AHEAD = (0.0, 0.25, 0.5, 1.0)  # [s]: critics read how near obstacles are, and will be at the present velocity
+LOOK_AHEAD = (0.25, 0.5, 1.0)  # [s]: critics also read how near obstacles will be then, at the present velocity
 
 
 class ControlStep:
@@ -121,10 +121,11 @@ class ControlStep:
         if isinstance(camera := env.disturbances.get("camera"), MountedCamera):
             more["depth"] = camera.image(state)
         if env.scene is not None:  # for critics, which may know more than policies
-            coming = [state["position"] + time * state["velocity"] for time in LOOK_AHEAD]
-            distance, away = env.scene.nearest({**state, "position": torch.stack(coming, 1)})
-            away = quaternion.rotate_inverse(state["quaternion"], away[:, 0])
-            more["obstacle"] = torch.cat((distance[:, :1, 0], away, distance[:, 1:, 0]), -1)
+            distance, away = env.scene.nearest(state)  # a compiler shares it with the reward
+            away = quaternion.rotate_inverse(state["quaternion"], away)
+            coming = torch.stack([state["position"] + time * state["velocity"] for time in LOOK_AHEAD], 1)
+            later, _ = env.scene.nearest({**state, "position": coming})
+            more["obstacle"] = torch.cat((distance, away, later.squeeze(-1)), -1)
         return {"observation": self.observe(state), **more, "metrics": metrics}
 
     def observe(self, state: State) -> Tensor:

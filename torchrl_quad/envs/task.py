@@ -316,12 +316,12 @@ def check_task(env: Task, state: State) -> dict[Key, Disturbance]:
     adds_some = type(env).episode_metrics is not Task.episode_metrics  # which may give what metrics() lacks
     check(adds_some or not missing, f"metrics(state) lacks {', '.join(missing)}, which metric_info describes.")
     for each in (env, *env.disturbances.values()):
-        hint = "privileged must be entries of the state, (n, k), each with a factor, such as {'position': 1.0}; got"
-        hint = f"{type(each).__name__}.{hint}"
+        wanted = "entries of the state, (n, k), each with a factor, such as {'position': 1.0}"
+        hint = f"{type(each).__name__}.privileged must be {wanted}; got"
         _check(isinstance(each.privileged, Mapping), f"{hint} {each.privileged!r}.")
         for key, factor in each.privileged.items():
-            is_right = isinstance(factor, numbers.Real) and key in state and state[key].dim() == 2
-            is_right = is_right and math.isfinite(factor)
+            is_factor = isinstance(factor, numbers.Real) and math.isfinite(factor)
+            is_right = is_factor and key in state and state[key].dim() == 2
             _check(is_right, f"{hint} {key!r}: {factor!r}. The state has: {', '.join(map(str, state))}.")
     for method in ("is_crash", "is_success"):
         check_tensor(f"{method}(state)", call(method, state), torch.bool)

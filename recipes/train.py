@@ -19,8 +19,11 @@ def main(cfg: DictConfig) -> None:
     scale = ReturnScale(loss)
     run = Run(cfg, env, actor, loss, [actor_optimizer, critic_optimizer, scale])
     for _ in run:
-        # After a stall less noise shakes the drones, and actions follow the simulator further before the critic.
-        actor.scale_noise(max(run.pace, 0.25))
+        # Where gradients explode over the shortest horizon, and after a stall, the actor learns slower with less noise.
+        pace = run.pace * loss.pace
+        actor_optimizer.param_groups[0]["lr"] *= loss.pace
+        actor.scale_noise(max(pace, 0.25))
+        # After a stall actions follow the simulator further before the critic.
         loss.gradient_lmbda = 1.0 - run.pace * (1.0 - cfg.loss.gradient_lmbda)
         # Until nine tenths of the episodes are solved, or returns level off, the discount looks half as far ahead.
         loss.value_estimator.gamma.fill_(cfg.gamma if run.looks_ahead else max(2.0 * cfg.gamma - 1.0, 0.0))
@@ -39,13 +42,13 @@ def main(cfg: DictConfig) -> None:
         data = loss.write_value_target(data)
         scale.update(data)
         rate = actor_optimizer.param_groups[0]["lr"]
-        share = max(rate / (run.pace * actor_optimizer.first_lr), 1 / 3)
+        share = max(rate / (pace * actor_optimizer.first_lr), 1 / 3)
         critic_metrics = run.fit_critic(critic_optimizer, data, times=1 / share)
 
         update_normalizer(env, rollout)
         run.carry = restart(env, end, cfg.restart_fraction)
         loss.adapt_horizon(mean_of_all(metrics["stiffness"]))
-        run.record(horizon=run.horizon, rate=rate, pace=run.pace, scale=scale.value, loss_actor=loss_actor)
+        run.record(horizon=run.horizon, rate=rate, pace=pace, scale=scale.value, loss_actor=loss_actor)
         run.record(**metrics, **critic_metrics)
 
 

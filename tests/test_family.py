@@ -183,6 +183,23 @@ def test_the_horizon_gets_shorter_where_the_dynamics_are_stiff_and_longer_where_
     assert again.length.item() == pytest.approx(50, rel=1e-3)
 
 
+def test_where_the_shortest_horizon_is_too_stiff_the_actor_learns_slower_instead():
+    loss = make_ahac(horizon=32, min_horizon=16, horizon_lr=0.1, min_pace=0.25)
+    found = []
+    for stiffness in (*[9.0] * 40, *[1.0] * 80):
+        loss.adapt_horizon(torch.tensor(stiffness))
+        found.append((loss.horizon, loss.pace))
+    falls, rises = found[:40], found[40:]
+    assert falls[-1] == (16, 0.25) and falls == sorted(falls, reverse=True) and rises[-1] == (64, 1.0)
+    between = [pace for horizon, pace in found if 0.25 < pace < 1.0]
+    assert len(between) > 10 and all(horizon == 16 for horizon, pace in found if pace < 1.0)
+    assert all(pace == 1.0 for horizon, pace in found if horizon > 16)
+    again = make_ahac(horizon=32, min_horizon=16, min_pace=0.25)
+    loss.length.fill_(8.0)
+    again.load_state_dict(loss.state_dict())
+    assert (again.horizon, again.pace) == (16, 0.5)
+
+
 def test_the_stiffness_is_the_root_mean_square_of_the_action_gradients_in_medians():
     loss = make_ahac()
     grad = torch.tensor([[3.0, 4.0], [0.0, 5.0], [0.0, 0.0], [0.0, 25.0]]).view(2, 2, 2)

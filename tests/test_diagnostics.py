@@ -99,7 +99,8 @@ def test_an_audit_needs_no_gradient_mode_and_counts_no_gradient_that_is_not_fini
 
 def fly(task, horizon=24, **options):
     """A horizon in which every term is paid: drones above and beside the pad, before a gate, and in free flight."""
-    env = (functools.partial(make_env, task) if isinstance(task, str) else task)(num_envs=6, seed=0, **options)
+    options = {"num_envs": 6, "seed": 0, **options}
+    env = (functools.partial(make_env, task) if isinstance(task, str) else task)(**options)
     td = env.reset()
     state = td["state"]
     if task == "landing":
@@ -198,6 +199,21 @@ def test_a_success_that_is_always_true_and_a_large_observation_are_traps_and_a_c
     always, large = audit_reward(*fly(EasyEnv, 12, weights=NO_ATTITUDE), gamma=0.99).traps
     assert always.startswith("success is true in every step")
     assert large.startswith("the observation has entries of more than a hundred in the mean: 13 (1e+04), 14 (1e+04)")
+
+
+class ClockedEnv(HoveringEnv):
+    """A task whose target moves after six steps, whatever the drone does."""
+
+    def advance(self, previous, state):
+        moved = self.tensor([3.0, 0.0, 0.0]) * (state["step"] == 6)
+        return {**state, "target": state["target"] + moved}
+
+
+def test_what_jumps_by_the_clock_is_no_trap_as_no_drone_delays_it_by_waiting():
+    rollout, actor = fly(ClockedEnv, 12, weights=NO_ATTITUDE)
+    assert audit_reward(rollout, actor, gamma=0.99).traps == []
+    one = audit_reward(*fly(ClockedEnv, 12, weights=NO_ATTITUDE, num_envs=1), gamma=0.99)  # which tells no clock
+    assert re.match("target jumped 1 times, and a step then paid", one.traps[0])
 
 
 def test_a_reward_without_any_gradient_and_starts_that_crash_at_once_are_traps():

@@ -14,7 +14,9 @@ from torchrl_quad.training.loop import Run
 @recipe("train")
 def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
-    loss = make_loss(AHACLoss, cfg, env, actor, make_value, horizon=cfg.horizon)
+    # A memory learns what matters within a horizon, so those of a policy that has one get longer.
+    longest = cfg.loss.max_horizon or (4 if "recurrent_state" in actor.in_keys else 2) * cfg.horizon
+    loss = make_loss(AHACLoss, cfg, env, actor, make_value, horizon=cfg.horizon, max_horizon=longest)
     actor_optimizer, critic_optimizer = Optimizer(cfg, "actor", loss), Optimizer(cfg, "critic", loss)
     scale = ReturnScale(loss)
     run = Run(cfg, env, actor, loss, [actor_optimizer, critic_optimizer, scale])

@@ -87,6 +87,25 @@ def test_every_recipe_trains_on_its_tasks_and_leaves_what_it_promises(launch, no
         assert summary["best_steps"] == best["steps"] in steps
 
 
+@cases(("false", 4), ("true", 8))
+def test_horizons_of_train_py_get_twice_as_long_and_with_a_memory_four_times(
+    memory, longest, train, no_pictures, tmp_path
+):
+    words = ["horizon=2", "loss.max_stiffness=1e9", "total_steps=400", f"actor.recurrent={memory}", "eval.interval=10"]
+    train("train", tmp_path, *words)
+    assert float(read_rows(tmp_path / "metrics.csv")[-1]["train/horizon"]) == longest
+
+
+def test_train_py_learns_slower_where_the_shortest_horizon_is_too_stiff(train, no_pictures, tmp_path):
+    words = ["horizon=2", "loss.max_stiffness=1.000001", "loss.horizon_lr=0.5", "actor.schedule=constant"]
+    train("train", tmp_path, *words, "total_steps=240", "eval.interval=6")
+    rows = read_rows(tmp_path / "metrics.csv")
+    found = [[float(x[f"train/{name}"]) for name in ("horizon", "rate", "pace")] for x in rows]
+    assert all(horizon == 2 and rate == pytest.approx(1e-2 * pace) for horizon, rate, pace in found)
+    paces = [pace for *_, pace in found]
+    assert paces[0] > 0.9 > 0.3 > paces[-1] >= 0.25 and paces == sorted(paces, reverse=True)
+
+
 @pytest.mark.parametrize("recipe", ["abpt", "ppo"])
 def test_evaluation_repeats_the_summary_of_the_run_also_with_a_normalizer(train, launch, recipe, tmp_path, request):
     if recipe != "abpt":  # the others draw by the same functions

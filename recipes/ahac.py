@@ -19,6 +19,7 @@ def main(cfg: DictConfig) -> None:
     bound = trust_region(cfg, actor)
     run = Run(cfg, env, actor, loss, [actor_optimizer, critic_optimizer])
     for _ in run:
+        actor_optimizer.param_groups[0]["lr"] *= loss.lr_factor
         run.horizon = loss.horizon
         # The actor: up the return of one horizon and the value of its end, through the dynamics.
         rollout, end = differentiable_rollout(env, actor, run.carry, run.horizon)

@@ -1,4 +1,4 @@
-"""One setting for every task: AHAC with one set of numbers; scale, discount, noise and end follow from the run.
+"""One setting for every task: AHAC with one set of numbers; scale, discount, rate, noise and end follow from the run.
 
 python recipes/train.py task=hovering seed=0
 """
@@ -14,17 +14,18 @@ from torchrl_quad.training.loop import Run
 @recipe("train")
 def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
-    # A memory learns what matters within a horizon, so those of a policy that has one get longer.
-    longest = cfg.loss.max_horizon or (4 if "recurrent_state" in actor.in_keys else 2) * cfg.horizon
+    longest = cfg.loss.max_horizon
+    if longest is None and "recurrent_state" in actor.in_keys:  # gradients reach back through a memory for one horizon
+        longest = 4 * cfg.horizon
     loss = make_loss(AHACLoss, cfg, env, actor, make_value, horizon=cfg.horizon, max_horizon=longest)
     actor_optimizer, critic_optimizer = Optimizer(cfg, "actor", loss), Optimizer(cfg, "critic", loss)
     scale = ReturnScale(loss)
     run = Run(cfg, env, actor, loss, [actor_optimizer, critic_optimizer, scale])
     for _ in run:
-        # Where gradients explode over the shortest horizon, and after a stall, the actor learns slower with less noise.
-        pace = run.pace * loss.pace
-        actor_optimizer.param_groups[0]["lr"] *= loss.pace
-        actor.scale_noise(max(pace, 0.25))
+        # Stiff gradients slow the actor down, as stalls do, for which Run has lowered the rate. Both leave less noise.
+        factor = run.pace * loss.lr_factor
+        actor_optimizer.param_groups[0]["lr"] *= loss.lr_factor
+        actor.scale_noise(max(factor, 0.25))
         # After a stall actions follow the simulator further before the critic.
         loss.gradient_lmbda = 1.0 - run.pace * (1.0 - cfg.loss.gradient_lmbda)
         # Until nine tenths of the episodes are solved, or returns level off, the discount looks half as far ahead.
@@ -40,18 +41,18 @@ def main(cfg: DictConfig) -> None:
             if not run.optimise(actor_optimizer, loss_actor):
                 break
 
-        # The critics: towards TD(lambda) targets, from the least of them; the more steps, the slower the actor learns.
+        # The critics: towards TD(lambda) targets, from the least of them; more steps as the schedule lowers the rate.
         data = loss.write_value_target(data)
         scale.update(data)
         rate = actor_optimizer.param_groups[0]["lr"]
-        share = max(rate / (pace * actor_optimizer.first_lr), 1 / 3)
+        share = max(rate / (factor * actor_optimizer.first_lr), 1 / 3)
         critic_metrics = run.fit_critic(critic_optimizer, data, times=1 / share)
 
         update_normalizer(env, rollout)
         run.carry = restart(env, end, cfg.restart_fraction)
         loss.adapt_horizon(mean_of_all(metrics["stiffness"]))
-        run.record(horizon=run.horizon, rate=rate, pace=pace, scale=scale.value, loss_actor=loss_actor)
-        run.record(**metrics, **critic_metrics)
+        run.record(horizon=run.horizon, rate=rate, pace=run.pace, lr_factor=factor / run.pace, scale=scale.value)
+        run.record(loss_actor=loss_actor, **metrics, **critic_metrics)
 
 
 if __name__ == "__main__":

@@ -184,20 +184,20 @@ def test_the_horizon_gets_shorter_where_the_dynamics_are_stiff_and_longer_where_
 
 
 def test_where_the_shortest_horizon_is_too_stiff_the_actor_learns_slower_instead():
-    loss = make_ahac(horizon=32, min_horizon=16, horizon_lr=0.1, min_pace=0.25)
+    loss = make_ahac(horizon=32, min_horizon=16, horizon_lr=0.1, min_lr_factor=0.25)
     found = []
     for stiffness in (*[9.0] * 40, *[1.0] * 80):
         loss.adapt_horizon(torch.tensor(stiffness))
-        found.append((loss.horizon, loss.pace))
+        found.append((loss.horizon, loss.lr_factor))
     falls, rises = found[:40], found[40:]
     assert falls[-1] == (16, 0.25) and falls == sorted(falls, reverse=True) and rises[-1] == (64, 1.0)
-    between = [pace for horizon, pace in found if 0.25 < pace < 1.0]
-    assert len(between) > 10 and all(horizon == 16 for horizon, pace in found if pace < 1.0)
-    assert all(pace == 1.0 for horizon, pace in found if horizon > 16)
-    again = make_ahac(horizon=32, min_horizon=16, min_pace=0.25)
+    between = [factor for horizon, factor in found if 0.25 < factor < 1.0]
+    assert len(between) > 10 and all(horizon == 16 for horizon, factor in found if factor < 1.0)
+    assert all(factor == 1.0 for horizon, factor in found if horizon > 16)
+    again = make_ahac(horizon=32, min_horizon=16, min_lr_factor=0.25)
     loss.length.fill_(8.0)
     again.load_state_dict(loss.state_dict())
-    assert (again.horizon, again.pace) == (16, 0.5)
+    assert (again.horizon, again.lr_factor) == (16, 0.5)
 
 
 def test_the_stiffness_is_the_root_mean_square_of_the_action_gradients_in_medians():

@@ -19,7 +19,9 @@ from torchrl_quad import HoveringEnv, LandingEnv, SHACLoss, differentiable_rollo
 from torchrl_quad.envs import TASKS
 from torchrl_quad.envs.metrics import EPISODE_METRICS
 from torchrl_quad.files import read_rows
-from torchrl_quad.training.building import build_env
+from torchrl_quad.modules.actors import TanhGaussianActor
+from torchrl_quad.training import loop
+from torchrl_quad.training.building import Optimizer, build_env
 from torchrl_quad.training.checkpoints import read_checkpoint, write_checkpoint
 from torchrl_quad.training.evaluation import drawing_from, evaluate
 from torchrl_quad.training.schema import LOSSES, settings
@@ -87,23 +89,37 @@ def test_every_recipe_trains_on_its_tasks_and_leaves_what_it_promises(launch, no
         assert summary["best_steps"] == best["steps"] in steps
 
 
-@cases(("false", 4), ("true", 8))
+@cases(("false", "null", 4), ("true", "null", 8), ("true", "3", 3))
 def test_horizons_of_train_py_get_twice_as_long_and_with_a_memory_four_times(
-    memory, longest, train, no_pictures, tmp_path
+    memory, most, longest, train, no_pictures, tmp_path
 ):
-    words = ["horizon=2", "loss.max_stiffness=1e9", "total_steps=400", f"actor.recurrent={memory}", "eval.interval=10"]
-    train("train", tmp_path, *words)
+    words = [f"actor.recurrent={memory}", f"loss.max_horizon={most}", "loss.max_stiffness=1e9", "horizon=2"]
+    train("train", tmp_path, *words, "total_steps=400", "eval.interval=10")
     assert float(read_rows(tmp_path / "metrics.csv")[-1]["train/horizon"]) == longest
 
 
-def test_train_py_learns_slower_where_the_shortest_horizon_is_too_stiff(train, no_pictures, tmp_path):
-    words = ["horizon=2", "loss.max_stiffness=1.000001", "loss.horizon_lr=0.5", "actor.schedule=constant"]
-    train("train", tmp_path, *words, "total_steps=240", "eval.interval=6")
-    rows = read_rows(tmp_path / "metrics.csv")
-    found = [[float(x[f"train/{name}"]) for name in ("horizon", "rate", "pace")] for x in rows]
-    assert all(horizon == 2 and rate == pytest.approx(1e-2 * pace) for horizon, rate, pace in found)
-    paces = [pace for *_, pace in found]
-    assert paces[0] > 0.9 > 0.3 > paces[-1] >= 0.25 and paces == sorted(paces, reverse=True)
+@pytest.mark.parametrize("recipe", ["train", "ahac"])
+def test_where_the_shortest_horizon_is_too_stiff_the_actor_learns_slower_with_less_noise(
+    recipe, train, no_pictures, monkeypatch, tmp_path
+):
+    rates, noise, critic = [], [], []
+    fit, step = loop.Run.fit_critic, Optimizer.step
+    monkeypatch.setattr(loop.Run, "fit_critic", lambda *args, **times: (fit(*args, **times), critic.append(times))[0])
+    monkeypatch.setattr(
+        Optimizer, "step", lambda self: (step(self), rates.append((self.name, self.param_groups[0]["lr"])))
+    )
+    monkeypatch.setattr(TanhGaussianActor, "scale_noise", lambda _, share: noise.append(share))
+    words = ["loss.max_stiffness=1.000001", "loss.min_lr_factor=0.25", "loss.horizon_lr=0.5", "actor.schedule=constant"]
+    train(recipe, tmp_path, *words, "horizon=2", "loss.min_horizon=2", "total_steps=240", "eval.interval=6")
+    rates = [rate / settings(recipe)["actor"]["lr"] for name, rate in rates if name == "actor"]
+    factors = list(dict.fromkeys(rates))
+    assert factors[0] == 1.0 and 0.3 > factors[-1] == pytest.approx(0.25) and factors == sorted(factors, reverse=True)
+    if recipe == "train":
+        assert list(dict.fromkeys(noise)) == pytest.approx(factors) and all(
+            x["times"] == pytest.approx(1) for x in critic
+        )
+        rows = read_rows(tmp_path / "metrics.csv")
+        assert {x["train/pace"] for x in rows} == {"1.0"} and float(rows[-1]["train/lr_factor"]) == pytest.approx(0.25)
 
 
 @pytest.mark.parametrize("recipe", ["abpt", "ppo"])

@@ -291,8 +291,8 @@ def train_one_setting(environment: str, seed: int) -> tuple[float, float, float]
     scale, average = ReturnScale(loss), cast("AveragedModel", average_policy(cfg, actor))
 
     def iterate(_: float, carry: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        actor_optimizer.param_groups[0]["lr"] *= loss.pace
-        actor.scale_noise(max(loss.pace, 0.25))
+        actor_optimizer.param_groups[0]["lr"] *= loss.lr_factor
+        actor.scale_noise(loss.lr_factor)
         rollout, carry = differentiable_rollout(place.env, actor, carry, loss.horizon)
         scale.divide(rollout)
         target, metrics = loss.better_actions(rollout, cfg.step)
@@ -303,7 +303,7 @@ def train_one_setting(environment: str, seed: int) -> tuple[float, float, float]
         average.update_parameters(actor)
         data = loss.write_value_target(data)
         scale.update(data)
-        share = max(actor_optimizer.param_groups[0]["lr"] / (loss.pace * actor_optimizer.first_lr), 1 / 3)
+        share = max(actor_optimizer.param_groups[0]["lr"] / (loss.lr_factor * actor_optimizer.first_lr), 1 / 3)
         for batch in minibatches(data, cfg.critic, 1 / share):
             optimise(critic_optimizer, loss.loss_value(batch)[0], cfg.critic.max_grad_norm)
         loss.adapt_horizon(metrics["stiffness"])

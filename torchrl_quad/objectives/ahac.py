@@ -28,12 +28,12 @@ class AHACLoss(SHACLoss):
 
         phi <- phi + 0.2 (clip(stiffness / max_stiffness - 1, -1, 1) - phi),    N <- N exp(-horizon_lr phi)
 
-    Where even the shortest horizon is too stiff, N may fall on, to ``min_pace`` times ``min_horizon``, and the actor
-    learns slower instead: multiply its learning rate by ``loss.pace``. Large steps make policies that barely hold a
-    drone, and their flights make gradients explode.
+    A rollout has N steps, but at least ``min_horizon``. With ``min_lr_factor`` below 1, N falls on while even the
+    shortest horizon is too stiff, to ``min_lr_factor * min_horizon``. Multiply the actor's learning rate by
+    ``loss.lr_factor``, N / ``min_horizon``, before each iteration: smaller updates make exploding gradients rarer.
 
     The least of two critics without target networks is the value at the end of the horizon, and that of their targets.
-    Georgiev et al. average over the horizon, and have no ``pace``.
+    Georgiev et al. average over the horizon, and have no ``lr_factor``.
 
     .. code-block:: python
 
@@ -53,8 +53,8 @@ class AHACLoss(SHACLoss):
         min_horizon: the shortest horizon; None for a quarter of the first.
         max_horizon: the longest horizon; None for twice the first.
         max_stiffness: the bound on the stiffness, above which the horizon gets shorter; 1.5 to 5 are usual.
-        horizon_lr: the share by which the horizon may change in an iteration.
-        min_pace: the least ``pace``; at 1 it stays 1.
+        horizon_lr: the share by which the horizon, or ``lr_factor``, may change in an iteration.
+        min_lr_factor: the least ``lr_factor``; 1 never lowers the learning rate.
         gradient_lmbda: at 1 actions follow the gradient of J, below 1 each that of its own lambda-return, with the
             critic's value after every step, as in Dreamer (Hafner et al. 2020, arXiv:1912.01603). The rewards of
             1 / (1 - lmbda) steps count, and the critic accounts for what jumps, such as a target. 0.98 is usual.
@@ -73,7 +73,7 @@ class AHACLoss(SHACLoss):
         max_horizon: Horizon | None = None,
         max_stiffness: Annotated[float, Field(gt=1, le=1e30)] = 2.0,
         horizon_lr: Below1 = 0.1,
-        min_pace: Share = 1.0,
+        min_lr_factor: Share = 1.0,
         gradient_lmbda: Share = 1.0,
         num_value_nets: Copies = 2,
         **kwargs: Any,
@@ -89,7 +89,7 @@ class AHACLoss(SHACLoss):
                 f"gradient_lmbda={gradient_lmbda} takes the critic's gradient after every step, which "
                 "terminal_gradient=False cuts: leave one of them out."
             )
-        self.min_horizon, self.max_horizon, self.min_pace = low, high, min_pace
+        self.min_horizon, self.max_horizon, self.min_lr_factor = low, high, min_lr_factor
         self.max_stiffness, self.horizon_lr, self.gradient_lmbda = max_stiffness, horizon_lr, gradient_lmbda
         number = {"device": self._default_device, "dtype": torch.float64}
         self.register_buffer("length", torch.tensor(horizon, **number))
@@ -101,13 +101,13 @@ class AHACLoss(SHACLoss):
         return max(round(self.length.item()), self.min_horizon)
 
     @property
-    def pace(self) -> float:
+    def lr_factor(self) -> float:
         """What to multiply the actor's learning rate by: 1 unless the shortest horizon is too stiff."""
         return min(self.length.item() / self.min_horizon, 1.0)
 
     @torch.no_grad()
     def adapt_horizon(self, stiffness: Tensor) -> None:
-        """Shorten the horizon if the stiffness is above its bound, and lengthen it if it is below.
+        """Shorten the horizon, or lower ``lr_factor``, if the stiffness is above its bound; raise them if it is below.
 
         The stiffness is a scalar, as ``loss_actor`` measured it, of several processes their mean. Infinity, for a
         gradient that is not finite, shortens the horizon; NaN, for no gradient at all, changes nothing.
@@ -116,7 +116,7 @@ class AHACLoss(SHACLoss):
             return
         excess = (stiffness.to(self.length) / self.max_stiffness - 1.0).clamp(-1.0, 1.0)
         self.multiplier.lerp_(excess, SMOOTHING)
-        least = self.min_pace * self.min_horizon
+        least = self.min_lr_factor * self.min_horizon
         self.length.mul_((-self.horizon_lr * self.multiplier).exp()).clamp_(least, self.max_horizon)
 
     def _action_gradient(self, tensordict: TensorDictBase, objective: Tensor) -> Tensor:

@@ -141,7 +141,7 @@ def make_loss(
 ) -> _Loss:
     """Build the loss of a recipe, or the one that ``loss._target_`` names, with critic and discounts as configured.
 
-    ``make_critic`` is ``make_value`` or ``make_qvalue``; ``more`` are arguments of the loss that are no settings.
+    ``make_critic`` is ``make_value`` or ``make_qvalue``; ``more`` are arguments of the loss that override its settings.
     """
     options = plain(cfg.loss, resolve=True) | more
     if path := options.pop("_target_", None):

@@ -89,7 +89,7 @@ class Run:
         horizon: control steps of this iteration's rollout, ``cfg.horizon`` unless the algorithm sets it.
         levelled_off: whether it has stalled again at the lower rate; then it ends.
         looks_ahead: whether it has once solved nine tenths of an evaluation, or has long not risen.
-        pace: the share of its schedule's rate that the actor learns with.
+        pace: the factor by which stalls and collapses lower the actor's rate.
     """
 
     def __init__(

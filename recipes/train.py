@@ -22,9 +22,9 @@ def main(cfg: DictConfig) -> None:
     scale = ReturnScale(loss)
     run = Run(cfg, env, actor, loss, [actor_optimizer, critic_optimizer, scale])
     for _ in run:
-        # Stiff gradients slow the actor down, as stalls do, for which Run has lowered the rate. Both leave less noise.
-        factor = run.pace * loss.lr_factor
-        actor_optimizer.param_groups[0]["lr"] *= loss.lr_factor
+        # Stalls slow the actor down, for which Run has lowered the rate, or stiff gradients. Both leave less noise.
+        factor = min(run.pace, loss.lr_factor)
+        actor_optimizer.param_groups[0]["lr"] *= factor / run.pace
         actor.scale_noise(max(factor, 0.25))
         # After a stall actions follow the simulator further before the critic.
         loss.gradient_lmbda = 1.0 - run.pace * (1.0 - cfg.loss.gradient_lmbda)
@@ -50,9 +50,9 @@ def main(cfg: DictConfig) -> None:
 
         update_normalizer(env, rollout)
         run.carry = restart(env, end, cfg.restart_fraction)
-        loss.adapt_horizon(mean_of_all(metrics["stiffness"]))
-        run.record(horizon=run.horizon, rate=rate, pace=run.pace, lr_factor=factor / run.pace, scale=scale.value)
+        run.record(horizon=run.horizon, rate=rate, pace=run.pace, lr_factor=loss.lr_factor, scale=scale.value)
         run.record(loss_actor=loss_actor, **metrics, **critic_metrics)
+        loss.adapt_horizon(mean_of_all(metrics["stiffness"]))
 
 
 if __name__ == "__main__":

@@ -102,7 +102,7 @@ class AHACLoss(SHACLoss):
 
     @property
     def lr_factor(self) -> float:
-        """What to multiply the actor's learning rate by: 1 unless the shortest horizon is too stiff."""
+        """The factor for the actor's learning rate, 1 unless the shortest horizon is too stiff."""
         return min(self.length.item() / self.min_horizon, 1.0)
 
     @torch.no_grad()

@@ -221,6 +221,12 @@ def test_what_jumps_by_the_clock_is_no_trap_as_no_drone_delays_it_by_waiting():
     rollout, _ = differentiable_rollout(env, actor, carry, 12)
     assert len((rollout["next", "state", "target"][..., 0].diff(dim=1) > 1).nonzero()[:, 1].unique()) > 3
     assert audit_reward(rollout, actor, gamma=0.99).traps == []
+    rollout, actor = fly(ClockedEnv, 12, weights=NO_ATTITUDE)
+    for step in (torch.zeros(6, 12, 2), None):  # of another environment: the steps of the rollout count
+        rollout["next", "state"].pop("step")
+        if step is not None:
+            rollout["next", "state", "step"] = step
+        assert audit_reward(rollout, actor, gamma=0.99).traps == []
     few = audit_reward(*fly(ClockedEnv, 12, weights=NO_ATTITUDE, num_envs=3), gamma=0.99)  # which tell no clock
     assert few.traps[0].startswith(jumped.replace("6", "3"))
 

@@ -219,16 +219,19 @@ def _jumping(reward: Tensor, done: Tensor, state: Any) -> Iterator[str]:
     """
     reward, done = (x.reshape(-1, x.shape[-2]) for x in (reward, done))
     jumps, names, falls, usual = set(), [], [], 0.25 * (reward.quantile(0.9) - reward.quantile(0.1))
+    within = ~(done[:, :-3] | done[:, 1:-2] | done[:, 2:-1])
+    step = None if state is None else state.get("step", None)
+    if not isinstance(step, Tensor) or step.numel() != reward.numel():  # not of our environments: the step of the rollout
+        step = torch.arange(reward.shape[1], device=reward.device).expand_as(reward)
+    step = step.reshape(reward.shape)[:, 2:-1]
     for name, x in () if state is None else state.flatten_keys("/").items():
         if name.partition("/")[0] in _OF_THE_ENVIRONMENT or x.shape[: state.ndim] != state.shape:
             continue
         change = x.detach().to(reward).reshape(*reward.shape, -1).diff(dim=1).norm(dim=-1)
         alone = change[:, 1:-1] > 10.0 * torch.maximum(change[:, :-2], change[:, 2:]) + 1e-6
-        within = ~(done[:, :-3] | done[:, 1:-2] | done[:, 2:-1])
         alone &= within
-        step = state["step"].reshape(reward.shape)[:, 2:-1] if "step" in state else torch.arange(alone.shape[1])
-        for known in step.expand_as(alone)[alone].unique():
-            then = within & (step == known)
+        for time in step[alone].unique():
+            then = within & (step == time)
             if then.sum() >= 4 and alone[then].double().mean() >= 0.9:
                 alone &= ~then
         if alone.any():

@@ -221,7 +221,7 @@ def _jumping(reward: Tensor, done: Tensor, state: Any) -> Iterator[str]:
     jumps, names, falls, usual = set(), [], [], 0.25 * (reward.quantile(0.9) - reward.quantile(0.1))
     within = ~(done[:, :-3] | done[:, 1:-2] | done[:, 2:-1])
     step = None if state is None else state.get("step", None)
-    if not isinstance(step, Tensor) or step.numel() != reward.numel():  # not of our environments: the step of the rollout
+    if not isinstance(step, Tensor) or step.numel() != reward.numel():  # not of ours: the step of the rollout
         step = torch.arange(reward.shape[1], device=reward.device).expand_as(reward)
     step = step.reshape(reward.shape)[:, 2:-1]
     for name, x in () if state is None else state.flatten_keys("/").items():

@@ -213,16 +213,13 @@ def audit_reward(
 
 
 def _jumping(reward: Tensor, done: Tensor, state: Any) -> Iterator[str]:
-    """A target that jumps, which is an entry of the state that changes in one step and not in those beside it.
-
-    A jump in the same step of the episode in at least four flights, nine tenths of them, follows a clock, no arrival.
-    """
+    """A target that jumps: an entry of the state that changes in one step and not beside it, nor by a clock."""
     reward, done = (x.reshape(-1, x.shape[-2]) for x in (reward, done))
     jumps, names, falls, usual = set(), [], [], 0.25 * (reward.quantile(0.9) - reward.quantile(0.1))
     within = ~(done[:, :-3] | done[:, 1:-2] | done[:, 2:-1])
     step = None if state is None else state.get("step", None)
     if not isinstance(step, Tensor) or step.numel() != reward.numel():  # not of ours: the step of the rollout
-        step = torch.arange(reward.shape[1], device=reward.device).expand_as(reward)
+        step = torch.ones_like(reward).cumsum(1)
     step = step.reshape(reward.shape)[:, 2:-1]
     for name, x in () if state is None else state.flatten_keys("/").items():
         if name.partition("/")[0] in _OF_THE_ENVIRONMENT or x.shape[: state.ndim] != state.shape:
@@ -230,6 +227,7 @@ def _jumping(reward: Tensor, done: Tensor, state: Any) -> Iterator[str]:
         change = x.detach().to(reward).reshape(*reward.shape, -1).diff(dim=1).norm(dim=-1)
         alone = change[:, 1:-1] > 10.0 * torch.maximum(change[:, :-2], change[:, 2:]) + 1e-6
         alone &= within
+        # In one step of the episode in at least four flights, nine tenths of them, it is a clock.
         for time in step[alone].unique():
             then = within & (step == time)
             if then.sum() >= 4 and alone[then].double().mean() >= 0.9:

@@ -43,6 +43,9 @@ def _resolve(name: str, of_steps: Callable[[float], float]) -> None:
 
 _resolve("steps_in", lambda steps: min(max(round(steps), 1), 100_000))  # the longest horizon of the schema
 _resolve("decay_over", lambda steps: max(1.0 - 1.0 / steps, 0.0))  # per control step, with this time constant
+OmegaConf.register_new_resolver(  # ${any_drone:X,Y} is X where each episode draws another drone, else Y
+    "any_drone", lambda x, y, *, _root_: x if OmegaConf.select(_root_, "env.randomize") == "any" else y, replace=True
+)
 
 
 def compose(recipe: str, overrides: Iterable[str] = ()) -> DictConfig:

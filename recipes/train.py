@@ -27,9 +27,6 @@ def main(cfg: DictConfig) -> None:
         factor = min(run.pace, loss.lr_factor)
         actor_optimizer.param_groups[0]["lr"] *= factor / (run.pace * loss.lr_factor)
         actor.scale_noise(max(factor, 0.25))
-        # Stiff gradients are long where a drone is about to crash: the longer ones count.
-        if loss.clip:
-            loss.clip.factor = cfg.loss.clip_action_gradient / loss.lr_factor
         # After a stall actions follow the simulator further before the critic.
         loss.gradient_lmbda = 1.0 - run.pace * (1.0 - cfg.loss.gradient_lmbda)
         # Until nine tenths of the episodes are solved, or returns level off, the discount looks half as far ahead.

@@ -292,7 +292,6 @@ def train_one_setting(environment: str, seed: int) -> tuple[float, float, float]
 
     def iterate(_: float, carry: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         actor.scale_noise(loss.lr_factor)
-        loss.clip.factor = cfg.loss.clip_action_gradient / loss.lr_factor
         rollout, carry = differentiable_rollout(place.env, actor, carry, loss.horizon)
         scale.divide(rollout)
         target, metrics = loss.better_actions(rollout, cfg.step)

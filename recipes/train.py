@@ -22,12 +22,10 @@ def main(cfg: DictConfig) -> None:
     scale = ReturnScale(loss)
     run = Run(cfg, env, actor, loss, [actor_optimizer, critic_optimizer, scale])
     for _ in run:
-        # Stalls slow the actor down, for which Run has lowered the rate; so do stiff gradients, by fewer steps of the
-        # optimiser. The stronger of the two counts, and leaves less noise: the weaker is undone.
-        weaker = max(run.pace, loss.lr_factor)
-        actor_optimizer.param_groups[0]["lr"] /= weaker
-        epochs = max(round(cfg.epochs * loss.lr_factor), 1)
-        actor.scale_noise(max(min(run.pace, loss.lr_factor), 0.25))
+        # Stalls slow the actor down, for which Run has lowered the rate, or stiff gradients. Both leave less noise.
+        factor = min(run.pace, loss.lr_factor)
+        actor_optimizer.param_groups[0]["lr"] *= factor / run.pace
+        actor.scale_noise(max(factor, 0.25))
         # After a stall actions follow the simulator further before the critic.
         loss.gradient_lmbda = 1.0 - run.pace * (1.0 - cfg.loss.gradient_lmbda)
         # Until nine tenths of the episodes are solved, or returns level off, the discount looks half as far ahead.
@@ -38,7 +36,7 @@ def main(cfg: DictConfig) -> None:
         scale.divide(rollout)
         target, metrics = loss.better_actions(rollout, cfg.step)
         data = rollout.detach().set("action_target", target)
-        for _ in range(epochs):
+        for _ in range(cfg.epochs):
             loss_actor = loss.loss_fit(data)
             if not run.optimise(actor_optimizer, loss_actor):
                 break
@@ -47,7 +45,7 @@ def main(cfg: DictConfig) -> None:
         data = loss.write_value_target(data)
         scale.update(data)
         rate = actor_optimizer.param_groups[0]["lr"]
-        share = max(rate * weaker / (run.pace * actor_optimizer.first_lr), 1 / 3)
+        share = max(rate / (factor * actor_optimizer.first_lr), 1 / 3)
         critic_metrics = run.fit_critic(critic_optimizer, data, times=1 / share)
 
         update_normalizer(env, rollout)

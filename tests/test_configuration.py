@@ -145,6 +145,17 @@ def test_one_setting_spans_the_same_times_at_every_control_period(period):
     assert (cfg.horizon, cfg.actor.noise_correlation, cfg.gamma) == (64, 0.0, 0.5)
 
 
+@cases(
+    (["env.randomize=any"], (256, 8.0, 12_000_000)),
+    (["env.randomize=any", "num_envs=8"], (8, 8.0, 12_000_000)),
+    (["env.randomize={mass: {scale: [0.8, 1.2]}}"], (64, 2.0, 6_000_000)),
+)
+def test_one_setting_flies_more_drones_where_each_is_another(words, expected):
+    cfg = composed("train", *words)
+    check(cfg)
+    assert (cfg.num_envs, cfg.loss.clip_action_gradient, cfg.total_steps) == expected
+
+
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_the_command_line_has_the_last_word_and_may_set_what_is_optional(recipe):
     assert composed(recipe, "task=racing", "horizon=7").horizon == 7

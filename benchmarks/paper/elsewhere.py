@@ -291,18 +291,19 @@ def train_one_setting(environment: str, seed: int) -> tuple[float, float, float]
     scale, average = ReturnScale(loss), cast("AveragedModel", average_policy(cfg, actor))
 
     def iterate(_: float, carry: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        actor_optimizer.param_groups[0]["lr"] *= loss.lr_factor
         actor.scale_noise(loss.lr_factor)
         rollout, carry = differentiable_rollout(place.env, actor, carry, loss.horizon)
         scale.divide(rollout)
         target, metrics = loss.better_actions(rollout, cfg.step)
         data = rollout.detach().set("action_target", target)
-        for _ in range(max(round(cfg.epochs * loss.lr_factor), 1)):
+        for _ in range(cfg.epochs):
             if backward(loss.loss_fit(data), actor_optimizer, cfg.actor.max_grad_norm)[1].isfinite():
                 actor_optimizer.step()
         average.update_parameters(actor)
         data = loss.write_value_target(data)
         scale.update(data)
-        share = max(actor_optimizer.param_groups[0]["lr"] / actor_optimizer.first_lr, 1 / 3)
+        share = max(actor_optimizer.param_groups[0]["lr"] / (loss.lr_factor * actor_optimizer.first_lr), 1 / 3)
         for batch in minibatches(data, cfg.critic, 1 / share):
             optimise(critic_optimizer, loss.loss_value(batch)[0], cfg.critic.max_grad_norm)
         loss.adapt_horizon(metrics["stiffness"])

@@ -91,6 +91,7 @@ def test_a_bad_value_is_refused_by_name(kwargs, message):
     ("reward_terms", lambda _, s: {"near": s["velocity"].mul_(0.0)[:, :1]}, "writes into 'velocity' in place"),
     ("is_crash", lambda _, s: s["vel"] > 0.0, "is_crash asks for 'vel', which is no entry .* has: position"),
     ("reward_terms", lambda env, _: {"near": env.weights["near"]}, "asks for 'near', .*; the weights: survival, "),
+    ("reward_terms", lambda env, s: {"near": env.scene.nearest(s)[0]}, "asks None for 'nearest'. .* scene={'ground'"),
     ("reward_terms", lambda _, s: {"on": 0.1}, r"got float. Write torch.full_like\(state\['position'\]\[:, :1\], 0.1"),
     ("metrics", lambda _, s: {"far": s["step"]}, r"\['far'\] must be a tensor \(4, 1\), torch.float32; got"),
     ("reward_terms", lambda _, s: -s["position"], r"reward_terms\(state\) must be a mapping .*; got Tensor"),

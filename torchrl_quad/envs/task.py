@@ -240,6 +240,13 @@ def check_task(env: Task, state: State) -> dict[Key, Disturbance]:
                 f"{task}.{name} asks for {error}, which is no entry of the state or of weights. The state has: "
                 f"{', '.join(map(str, states[0]))}; the weights: {', '.join(env.weights) or 'nothing'}."
             ) from error
+        except AttributeError as error:
+            if error.name is None or error.obj is not None or env.scene is not None:
+                raise
+            raise UserValueError(
+                f"{task}.{name} asks None for {error.name!r}. If it asks self.scene: this environment has none. "
+                "Give it obstacles, such as scene={'ground': True}."
+            ) from error
         for key, x, version in before:
             changes = f"{name} writes into {key!r} in place, which changes the flight itself."
             check(x._version == version, f"{changes} Write x = x.clone() first, or use torch.where.")

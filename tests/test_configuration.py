@@ -146,14 +146,14 @@ def test_one_setting_spans_the_same_times_at_every_control_period(period):
 
 
 @cases(
-    (["env.randomize=any"], (256, 8.0, 12_000_000)),
-    (["env.randomize=any", "num_envs=8"], (8, 8.0, 12_000_000)),
-    (["env.randomize={mass: {scale: [0.8, 1.2]}}"], (64, 2.0, 6_000_000)),
+    (["env.randomize=any"], (256, 8.0)),
+    (["env.randomize=any", "num_envs=8"], (8, 8.0)),
+    (["env.randomize={mass: {scale: [0.8, 1.2]}}"], (64, 2.0)),
 )
 def test_one_setting_flies_more_drones_where_each_is_another(words, expected):
     cfg = composed("train", *words)
     check(cfg)
-    assert (cfg.num_envs, cfg.loss.clip_action_gradient, cfg.total_steps) == expected
+    assert (cfg.num_envs, cfg.loss.clip_action_gradient) == expected
 
 
 @pytest.mark.parametrize("recipe", RECIPES)

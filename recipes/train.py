@@ -23,9 +23,13 @@ def main(cfg: DictConfig) -> None:
     run = Run(cfg, env, actor, loss, [actor_optimizer, critic_optimizer, scale])
     for _ in run:
         # Stalls slow the actor down, for which Run has lowered the rate, or stiff gradients. Both leave less noise.
-        factor = min(run.pace, loss.lr_factor)
+        # Down to min_epochs fewer optimiser steps replace the lower rate, and longer gradients count.
+        epochs = max(round(loss.lr_factor * cfg.epochs), min(cfg.min_epochs, cfg.epochs))
+        factor = min(run.pace, loss.lr_factor * cfg.epochs / epochs)
         actor_optimizer.param_groups[0]["lr"] *= factor / run.pace
-        actor.scale_noise(max(factor, 0.25))
+        actor.scale_noise(max(min(run.pace, loss.lr_factor), 0.25))
+        if loss.clip is not None:
+            loss.clip.factor = cfg.loss.clip_action_gradient * cfg.epochs / epochs
         # After a stall actions follow the simulator further before the critic.
         loss.gradient_lmbda = 1.0 - run.pace * (1.0 - cfg.loss.gradient_lmbda)
         # Until nine tenths of the episodes are solved, or returns level off, the discount looks half as far ahead.
@@ -36,7 +40,7 @@ def main(cfg: DictConfig) -> None:
         scale.divide(rollout)
         target, metrics = loss.better_actions(rollout, cfg.step)
         data = rollout.detach().set("action_target", target)
-        for _ in range(cfg.epochs):
+        for _ in range(epochs):
             loss_actor = loss.loss_fit(data)
             if not run.optimise(actor_optimizer, loss_actor):
                 break

@@ -5,6 +5,7 @@ import json
 import math
 import re
 import sys
+from itertools import groupby
 
 import pytest
 import torch
@@ -20,6 +21,7 @@ from torchrl_quad.envs import TASKS
 from torchrl_quad.envs.metrics import EPISODE_METRICS
 from torchrl_quad.files import read_rows
 from torchrl_quad.modules.actors import TanhGaussianActor
+from torchrl_quad.objectives.calls import MedianClip
 from torchrl_quad.training import loop
 from torchrl_quad.training.building import Optimizer, build_env
 from torchrl_quad.training.checkpoints import read_checkpoint, write_checkpoint
@@ -98,27 +100,33 @@ def test_horizons_of_train_py_get_twice_as_long_and_with_a_memory_four_times(
     assert float(read_rows(tmp_path / "metrics.csv")[-1]["train/horizon"]) == longest
 
 
-@pytest.mark.parametrize("recipe", ["train", "ahac"])
+@cases(("ahac", 1), ("train", 8), ("train", 2))
 def test_where_the_shortest_horizon_is_too_stiff_the_actor_learns_slower_with_less_noise(
-    recipe, train, no_pictures, monkeypatch, tmp_path
+    recipe, least, train, no_pictures, monkeypatch, tmp_path
 ):
-    rates, noise, critic = [], [], []
-    fit, step = loop.Run.fit_critic, Optimizer.step
+    steps, noise, critic, clips = [], [], [], []
+    fit, step, clip = loop.Run.fit_critic, Optimizer.step, MedianClip.forward
     monkeypatch.setattr(loop.Run, "fit_critic", lambda *args, **times: (fit(*args, **times), critic.append(times))[0])
     monkeypatch.setattr(
-        Optimizer, "step", lambda self: (step(self), rates.append((self.name, self.param_groups[0]["lr"])))
+        Optimizer, "step", lambda self: (step(self), steps.append((self.name, self.param_groups[0]["lr"])))
     )
     monkeypatch.setattr(TanhGaussianActor, "scale_noise", lambda _, share: noise.append(share))
+    monkeypatch.setattr(MedianClip, "forward", lambda self, grad: (clips.append(self.factor), clip(self, grad))[1])
     words = ["loss.max_stiffness=1.000001", "loss.min_lr_factor=0.25", "loss.horizon_lr=0.5", "actor.schedule=constant"]
+    words += [f"min_epochs={least}"] * (recipe == "train")
     train(recipe, tmp_path, *words, "horizon=2", "loss.min_horizon=2", "total_steps=240", "eval.interval=6")
-    rates = [rate / settings(recipe)["actor"]["lr"] for name, rate in rates if name == "actor"]
-    factors = list(dict.fromkeys(rates))
+    rates = [rate / settings(recipe)["actor"]["lr"] for name, rate in steps if name == "actor"]
+    epochs = [len(list(some)) for name, some in groupby(name for name, _ in steps) if name == "actor"]
+    # What the rate and the optimiser's steps make together.
+    factors = list(dict.fromkeys(rates)) if least != 2 else [x / 8 for x in dict.fromkeys(epochs)]
     assert factors[0] == 1.0 and 0.3 > factors[-1] == pytest.approx(0.25) and factors == sorted(factors, reverse=True)
     if recipe == "train":
-        assert list(dict.fromkeys(noise)) == pytest.approx(factors)
-        assert all(x["times"] == pytest.approx(1) for x in critic)
+        assert epochs[-1] == least and (min(rates) > 0.8 or least == 8)  # epochs are whole
+        assert clips == pytest.approx([16 / x for x in epochs])
+        assert noise[0] == 1.0 and noise[-1] == pytest.approx(0.25) and noise == sorted(noise, reverse=True)
         rows = read_rows(tmp_path / "metrics.csv")
         assert {x["train/pace"] for x in rows} == {"1.0"} and float(rows[-1]["train/lr_factor"]) == pytest.approx(0.25)
+        assert all(x["times"] == pytest.approx(1) for x in critic)
 
 
 @pytest.mark.parametrize("recipe", ["abpt", "ppo"])

@@ -88,6 +88,7 @@ SETTINGS: dict[str, tuple[Any, str]] = {
     "restart_fraction": (Fraction, "The share of flights that each iteration gives up."),
     "step": (Positive, "The median change of an action that an iteration asks for, in units of the action."),
     "epochs": (Annotated[int, Field(ge=1, le=10_000)], "Passes over each rollout."),
+    "min_epochs": (Annotated[int, Field(ge=1, le=10_000)], "Of these, the least where gradients are stiff."),
     "batch_size": (Size, "Control steps in a minibatch."),
     "network.num_cells": (list[Width], "The width of every hidden layer, in a list: [64, 64], or [64] for one layer."),
     "network.activation": (cast("Any", Literal)[tuple(ACTIVATIONS.split())], ""),

@@ -163,15 +163,17 @@ def test_a_run_that_solves_nothing_says_what_may_be_the_reason(train, tmp_path, 
         assert starts == ["as this policy fli", "all episodes end a"] and len(said) == 4
 
 
-def test_a_return_that_has_levelled_off_unsolved_may_disagree_with_success():
-    def why(*returns, crash=0.0):
+def test_a_return_unsolved_may_disagree_with_success_or_pay_for_loitering():
+    def why(*returns, crash=0.0, ends_on_success=False):
         rows = [{"steps": i, "eval/return": x, "eval/solved": 0.1} for i, x in enumerate(returns, start=1)]
         rows[-1]["eval/crash"] = crash
-        return [x[:18] for x in evaluation.why_unsolved(rows, 5.0)]
+        return [x[:18] for x in evaluation.why_unsolved(rows, 5.0, ends_on_success)]
 
     assert why(1.0, *20 * [2.0]) == ["reward and success", "all episodes end a"]
     assert why(1.0, *9 * [2.0]) == why(*20 * [2.0]) == why(*range(20)) == ["all episodes end a"]
     assert why(1.0, *20 * [2.0], crash=0.1) == []
+    assert why(*range(20), ends_on_success=True) == ["loitering pays mor", "all episodes end a"]
+    assert why(*range(-20, 0), ends_on_success=True) == ["all episodes end a"]
 
 
 def test_a_run_that_solves_few_episodes_says_so_at_its_end(train, tmp_path, monkeypatch):

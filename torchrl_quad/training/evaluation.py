@@ -156,14 +156,20 @@ def looks_ahead(rows: Sequence[Mapping[str, float]], patience: float | None) -> 
     return patience is not None and any(stalls(rows[:n], 0, patience, solved=0) for n in range(30, len(rows) + 1))
 
 
-def why_unsolved(rows: Sequence[Mapping[str, float]], seconds: float) -> list[str]:
+def why_unsolved(rows: Sequence[Mapping[str, float]], seconds: float, ends_on_success: bool) -> list[str]:
     """What may keep a run of episodes of so many seconds from solving more, besides traps of the reward."""
     if rows[-1]["eval/crash"] >= 0.05:
         return []
-    rose = last_rise(rows) > rows[0]["steps"]
-    disagree = "reward and success disagree: returns have levelled off, and most episodes are not solved"
+    found, usual = [], rows[-1]["eval/return"]  # of episodes few of which are solved
+    if last_rise(rows) > rows[0]["steps"] and stalls(rows, 0, 0.33, solved=0.0):
+        found.append("reward and success disagree: returns have levelled off, and most episodes are not solved")
+    if ends_on_success and usual > 0.0:
+        found.append(
+            f"loitering pays more: success ends the episode, and one without success returns {usual:.3g}. Let success "
+            "pay more than that, or the episode go on"
+        )
     limit = f"all episodes end after {seconds:.3g} s: if drones still come nearer then, set max_episode_steps"
-    return [disagree, limit] if rose and stalls(rows, 0, 0.33, solved=0.0) else [limit]
+    return [*found, limit]
 
 
 @contextlib.contextmanager

@@ -333,7 +333,7 @@ class Run:
         solved = max(x["eval/solved"] for x in self.rows)
         result = f"At most {100 * solved:.2g} % of the episodes are solved" if solved else "Nothing is solved"
         seconds = self.task.max_episode_steps * self.task.control_dt
-        for trap in [*self._traps(), *why_unsolved(self.rows, seconds)]:
+        for trap in [*self._traps(), *why_unsolved(self.rows, seconds, self.task.ends_on_success)]:
             torchrl_logger.warning(f"{result} after {self.steps:,} steps. Perhaps {trap}.")
 
     def _traps(self) -> Sequence[str]:

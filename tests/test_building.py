@@ -213,6 +213,11 @@ def test_the_rate_quarters_where_a_run_stalls_halves_where_it_has_lost_its_way_a
     assert next(n for n in range(21, 62) if next_pace(curve[:n], 250, 0.5) == 0.25) == 50
     assert next_pace(curve[:5], 0, None) == next_pace(curve, 0, None) == 1.0
     assert next_pace([*curve[:21], {"steps": 220, "eval/return": 10.0, "eval/solved": 0.3}], 0, 0.5) == 0.5
+    fell = [{"steps": 210 + i, "eval/return": -i, "eval/solved": 0.3} for i in range(14)]
+    fell[3] = fell[3] | {"eval/return": math.nan}
+    lucky = [*curve[:21], *fell, {"steps": 225, "eval/return": 30.0, "eval/solved": 0.6}, *fell[:3]]
+    paces = [next_pace(lucky[:n], 0, 0.9) for n in range(22, 40)]
+    assert paces == [*[0.5] * 11, *[2.0] * 4, *[0.5] * 3]  # to one policy a run goes back at half the rate eleven times
     rare = [row | {"steps": 100 * row["steps"], "eval/return": 1.0} for row in curve[1:]]
     assert [next_pace(curve[:1] + rare[:n], 0, 0.5) for n in range(1, 11)] == [*[1.0] * 9, 0.25]  # ten at least
 

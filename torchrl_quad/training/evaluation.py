@@ -140,11 +140,18 @@ STALLED = 0.25  # by which a stall changes the pace
 
 def next_pace(rows: Sequence[Mapping[str, float]], since: int, patience: float | None) -> float:
     """By what the actor's rate changes after a run's last evaluation: a quarter where it stalls, a half where it has
-    lost its way, 2 where it rises."""
+    lost its way, 2 where it rises.
+
+    A policy from which a run has lost its way a dozen times was good by luck. The run then goes on without it, and the
+    rate doubles again.
+    """
     if stalls(rows, since, patience):
         return STALLED
     if has_lost_its_way(rows, patience):
-        return 0.5
+        scores = [merit({"solved": row["eval/solved"], "return": row["eval/return"]}, patience) for row in rows]
+        best = max((i for i, row in enumerate(rows) if math.isfinite(row["eval/return"])), key=scores.__getitem__)
+        lost = sum(has_lost_its_way(rows[:n], patience) for n in range(best + 2, len(rows) + 1))
+        return 0.5 if lost < 12 else 2.0
     return 2.0 if patience is not None and last_rise(rows) == rows[-1]["steps"] else 1.0
 
 

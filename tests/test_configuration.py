@@ -362,6 +362,7 @@ def test_a_task_may_have_other_defaults_of_arguments_that_callers_and_recipes_se
     assert (env.num_envs, env.reach, NearEnv(2, reach=0.3).reach, NearEnv(2).num_envs) == (3, 0.1, 0.3, 2)
     assert "drone='racer'" in repr(env) and "drone='racer'" in repr(env.rebuilt(num_envs=2))
     assert defaults(NearEnv) == {**defaults(CornerEnv), "reach": 0.1, "drone": "racer"}
+    assert type("NearerEnv", (NearEnv,), {"defaults": {"reach": 0.2}}).defaults == {**NearEnv.defaults, "reach": 0.2}
     NearEnv.defaults = {"drne": "racer"}
     refuses("argument 'drne'. Did you mean 'drone'", NearEnv, error=TypeError)
     for name, value in (("drone", "racer"), ("control_dt", 0.01), ("reach", 0.1)):

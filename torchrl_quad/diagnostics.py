@@ -83,7 +83,8 @@ class RewardAudit(dict[str, TermAudit]):
             )
         share = sum(self[name].return_share for name in lost)
         partially = f"partially differentiable: all but {', '.join(lost)}, {share:.1%} of the return"
-        lines += [partially if lost else "fully differentiable", *(f"trap: {trap}" for trap in self.traps)]
+        unseen = "".join(f"; not seen: {name}" for name, x in self.items() if x.verdict == "not seen")
+        lines += [(partially if lost else "fully differentiable") + unseen, *(f"trap: {trap}" for trap in self.traps)]
         lines += [f"not seen, start some drones close to it: {end}" for end in self.unseen]
         return "\n".join(lines)
 

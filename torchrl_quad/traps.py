@@ -44,8 +44,8 @@ def jumping_targets(reward: Tensor, done: Tensor, state: Any) -> Iterator[str]:
         before, after = (sum(x) / len(falls) for x in zip(*falls, strict=True))
         yield (
             f"{', '.join(names)} jumped {len(jumps)} times, and a step then paid {after:.3g} instead of {before:.3g}: "
-            "if a drone that waits there is paid the same, waiting pays more than arriving. Reward the velocity "
-            "towards the target, or the arrival"
+            "if a drone that waits there is paid the same, waiting pays more than arriving. If so, reward the "
+            "velocity towards the target, or the arrival"
         )
 
 

@@ -193,6 +193,7 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
+        cls.defaults = {k: x for base in reversed(cls.__mro__) for k, x in getattr(base, "defaults", {}).items()}
         if "__init__" in vars(cls):
             checked(cls)
         cls.__signature__ = config.full_signature(cls, EnvBase)

@@ -66,7 +66,7 @@ class Task(abc.ABC):
     task_entries: list[Key]  #: the names of the task's own entries of the state
     initial_state_source: Callable[[int], TensorDictBase] | None  #: where resets start, if not as the task says
 
-    defaults: Mapping[str, Any] = {}  #: of arguments, by name, where the task has others
+    defaults: Mapping[str, Any] = {}  #: of arguments, by name, where the task has others than its parent
     weights: Mapping[str, Any] = {}  #: of the reward's terms; an argument of the same name overrides some
     ends_on_success = False  #: whether success terminates the episode, too
     metric_info: Mapping[str, Metric] = EPISODE_METRICS  #: how each metric is summed up, printed and drawn, by name

@@ -65,7 +65,7 @@ def test_returns_gradients_and_shares_are_those_worked_by_hand():
     assert actor.module.weights.grad is None
     _, row, *_, last = repr(audit).splitlines()
     assert row.split() == ["linear", "36", "36.0%", "18", "24.3%", "differentiable"]
-    assert last == "partially differentiable: all but bonus, 5.0% of the return"
+    assert last == "partially differentiable: all but bonus, 5.0% of the return; not seen: crash"
     metrics = audit.metrics()
     assert metrics["quadratic_return_share"] == audit["quadratic"].return_share and len(metrics) == 10
 

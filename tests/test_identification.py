@@ -230,7 +230,7 @@ def test_arguments_of_fits_and_predictions_are_refused_in_one_line_and_a_flight_
         (NoFlight, "its motor commands are zero", prediction_error, still, no_motors),
         (UserError, "missing key 'nominal_voltage'", load_drone, plain | {"motor_command": {"speed_per_volt": 500.0}}),
         (UserError, "unknown key 'gain'. Allowed: speed", load_drone, plain | {"motor_command": {"gain": 1.0}}),
-        (UserError, "command must be a mapping .*; got 500.0", load_drone, plain | {"motor_command": 500.0}),
+        (UserError, "command: it must be a mapping .*; got 500.0", load_drone, plain | {"motor_command": 500.0}),
     ):
         refuses(message, call, *arguments, error=error)
     bad = [("position", x) for x in (None, 5, "a", np.zeros(3), np.nan * real.position)]

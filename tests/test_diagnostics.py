@@ -146,7 +146,7 @@ class DoubtfulEnv(HoveringEnv):
     """Hovering that ends with a bonus, and pays for being near: both well or badly, as the weights say."""
 
     ends_on_success = True
-    weights = {**HoveringEnv.weights, "attitude": 0.0, "arrival": 20.0, "near": 0.0, "width": 1.0, "visited": 0.0}
+    weights = {**HoveringEnv.weights, "attitude": 0.0, "arrival": 20.0, "near": 0.0, "width": 1.0}
     start_range, success_radius = (1.0, 0.5, 0.5), 0.3
 
     def initial_state(self, n):
@@ -164,6 +164,7 @@ class CountingEnv(DoubtfulEnv):
     """Pays in each step for how often a drone was near so far: of six, some are from the start, and some get there."""
 
     ends_on_success = False
+    weights = {**DoubtfulEnv.weights, "arrival": 0.0, "visited": 9.0}
 
     def initial_state(self, n):
         return {**super().initial_state(n), "visits": torch.zeros(n, 1, device=self.device)}
@@ -261,7 +262,7 @@ NO_ATTITUDE = {"attitude": 0.0}
     (DoubtfulEnv, {"arrival": 1.0}, "success ends an episode and pays 1.1, .*: loitering pays more"),
     (DoubtfulEnv, {"near": 10.0, "width": 0.08}, "'near' is flat in .* of the flights, those in which it pays least"),
     (HoveringEnv, {"survival": 0.0, **NO_ATTITUDE}, "as this policy flies .* must cost more than [0-9.]*, else dying"),
-    (CountingEnv, {"arrival": 0.0, "visited": 9.0}, "'visited' pays for each change of 'visits' in every later step"),
+    (CountingEnv, {}, "'visited' pays for each change of 'visits' in every later step"),
     (CrashedEnv, {}, "100% of the episodes end in their first step: look at the start, is_crash and is_success"),
     (DetachedEnv, {}, "'velocity' changes from step to step without a gradient: no numpy"),
     (HoveringEnv, {}, "'attitude' is less than a thousandth of return and gradient"),

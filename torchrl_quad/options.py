@@ -151,8 +151,7 @@ def build(cls: type[_T], name: str, spec: Any, **more: Any) -> _T:
     allowed = {key: x for key, x in inspect.signature(cls).parameters.items() if key not in more}
     listed = ", ".join(allowed)
     if not isinstance(spec, Mapping):
-        usual = {key: x.default for key, x in allowed.items() if x.default is not x.empty}
-        such = "".join(f", such as {shown({key: x})}" for key, x in [*usual.items()][:1])
+        such = next((f", such as {shown({k: x.default})}" for k, x in allowed.items() if x.default is not x.empty), "")
         wanted = f"it must be a mapping with any of {listed}{such}, or a {cls.__name__}"
         raise UserValueError(f"{name}: {wanted}; got {shown(spec)}.")
     for key in spec:

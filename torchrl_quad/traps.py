@@ -59,13 +59,15 @@ def _changes(state: Any, reward: Tensor) -> Iterator[tuple[str, Tensor]]:
 def paid_arrivals(name: str, term: Tensor, done: Tensor, state: Any) -> Iterator[str]:
     """A term that rises where an entry of the task's state changes, and pays as much in each later step."""
     term, done = (x.reshape(-1, x.shape[-2]) for x in (term.detach(), done))
-    rise = term.diff(dim=1).masked_fill(done[:, :-1], 0.0)
-    for entry, change in _changes(state, term):
-        if (rise >= 0.0).all() and rise.any() and torch.equal(rise > 0.0, (change > 0.0) & ~done[:, :-1]):
-            yield (
-                f"{name!r} pays for each change of {entry!r} in every later step, which drowns terms with a gradient: "
-                "pay once, in the step of the change"
-            )
+    rise, within = term.diff(dim=1), ~done[:, :-1]
+    rises = (rise > 0.0) & within
+    if not rises.any() or ((rise < 0.0) & within).any():
+        return
+    if entries := [entry for entry, change in _changes(state, term) if torch.equal(rises, (change > 0.0) & within)]:
+        yield (
+            f"{name!r} pays for each change of {', '.join(map(repr, entries))} in every later step, which drowns terms "
+            "with a gradient: pay once, in the step of the change"
+        )
 
 
 def costly_ends(reward: Tensor, ends: Mapping[str, Tensor], collided: Tensor, steps: float) -> Iterator[str]:
